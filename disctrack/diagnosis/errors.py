@@ -12,7 +12,7 @@ from disctrack.diagnosis.motion import state_of
 from disctrack.diagnosis.stretch import MIN_FRAMES
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut
-from disctrack.discrepancy.significance import Whiteness, ljung_box, ljung_box_p_value, whiteness
+from disctrack.discrepancy.significance import Whiteness, whiteness
 from disctrack.discrepancy.system import System, Values, subset
 from disctrack.rolling import Motion, simulate
 from disctrack.rolling.motion import effect_power
@@ -156,13 +156,12 @@ def residual_tests(system: DiscSystem, fit_: Fit, noise: float) -> ResidualTests
         return None
     pose, other = (part[full] for part in system.parts_of_residual(fit_.values))
     tested = whiteness(pose, system.rate, {})
-    lags, channels = min(20, max(1, n // 4)), other.shape[1]
     return ResidualTests(
         float(np.sum(pose**2) / max(6 * n - fit_.n_free, 1) / noise),
         float(np.sum(other**2) / max((most - 6) * n, 1) / noise),
         min(1.0, 2 * tested.p_value, 2 * 6 * float(tested.peak_p_value.min())),
-        min(1.0, channels * ljung_box_p_value(float(ljung_box(other, lags).max()), n, lags)),
-        12 + channels,
+        whiteness(other, system.rate, {}).p_value,
+        12 + other.shape[1],
     )
 
 

@@ -17,10 +17,9 @@ import numpy as np
 from calibration.kit.arrays import Array
 from disctrack.disc import Disc
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.significance import as_sigmas, wald
+from disctrack.discrepancy.significance import SURE, as_sigmas, wald
 from disctrack.discrepancy.system import Candidate, Values
 
-MIN_SIGMAS = 3.0  # significance of a coefficient after the refit; a first-order gain may not be confirmed
 WIDTHS = ("width", "softness", "length", "lasting")  # shape parameters that correlate with the amplitude
 HIGHEST_HARMONIC = 4  # of the angles
 DRIFT_DEGREE = 4  # of the polynomials in time
@@ -88,7 +87,7 @@ class LearnedLaw:
 
 def differ_from_zero(amounts: Array, covariance: Array) -> bool:
     """Are amounts (k,) with this covariance (k, k) jointly significant?"""
-    return as_sigmas(wald(amounts, covariance), len(amounts)) > MIN_SIGMAS
+    return as_sigmas(wald(amounts, covariance), len(amounts)) > SURE
 
 
 # Functions of the state: (words, formula).

@@ -15,12 +15,12 @@ import numpy as np
 
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import ResidualTests, residual_tests
-from disctrack.diagnosis.law_library import MIN_SIGMAS, Family, LearnedLaw, differ_from_zero
+from disctrack.diagnosis.law_library import Family, LearnedLaw, differ_from_zero
 from disctrack.diagnosis.missing_force import Gain, law_of
 from disctrack.discrepancy.fit import TRIAL, Fit, fit
 from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, equivalent, length, noise_gain
 from disctrack.discrepancy.shape import WORTH_A_SHAPE
-from disctrack.discrepancy.significance import bic_penalty
+from disctrack.discrepancy.significance import SURE, bic_penalty
 from disctrack.discrepancy.system import System
 
 MAX_TERMS = 3
@@ -200,7 +200,7 @@ def busy_amounts(fitted: Fit, names: Sequence[str]) -> dict[int, float]:
         inverse = np.linalg.pinv(precision[np.ix_(there, there)], rcond=1e-12, hermitian=True)
         left = inverse @ right[there]
         sigmas = np.abs(left) / np.sqrt(np.maximum(np.diag(inverse), 1e-300))
-        if len(there) == 1 or sigmas.min() > MIN_SIGMAS:
+        if len(there) == 1 or sigmas.min() > SURE:
             return {i: float(value * size[i]) for i, value in zip(there, left, strict=True)}
         del there[int(np.argmin(sigmas))]
 

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
-from disctrack.diagnosis.law_library import MIN_SIGMAS, SHAPES, Family, LearnedLaw, families
+from disctrack.diagnosis.law_library import SHAPES, Family, LearnedLaw, families
 from disctrack.diagnosis.motion import STATE_SCALES, THETA_END, state_of
 from disctrack.discrepancy.elimination import is_linear, prior_rows, projection
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.score import cleared, span
-from disctrack.discrepancy.significance import evidence
+from disctrack.discrepancy.score import DEPENDENT, cleared, span
+from disctrack.discrepancy.significance import SURE, evidence
 from disctrack.discrepancy.system import Candidate, Quantity, Values
 from disctrack.rolling import EffectParameter, Model, Motion
 from disctrack.rolling.effects.learned import effect_from_formulas
@@ -34,7 +34,6 @@ PROBES_PER_TURN = 7  # of the fastest angle, so that a moment locked to it is re
 MAX_PROBES = 90
 WIDTH = 0.7  # standard deviation of a probe over the spacing of the probes: their sum is flat to 1e-4
 INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % at 150 Hz
-INVISIBLE = 1e-8  # share of a column's power after projection, below which the data do not determine it
 CHUNK = 120  # families of the library that are evaluated at a time
 
 
@@ -54,7 +53,7 @@ class Course:
         """Size of a moment, the instant of its maximum, and the interval in which it is significant."""
         size = np.sum(self.values**2, axis=1)
         rms, largest = np.sqrt(np.mean(self.values**2, axis=0)), self.time[np.argmax(size)]
-        known = np.flatnonzero(size > MIN_SIGMAS**2 * np.sum(self.sigma**2, axis=1))
+        known = np.flatnonzero(size > SURE**2 * np.sum(self.sigma**2, axis=1))
         text = (
             f"a moment of {', '.join(f'{1e6 * x:.2g}' for x in rms)} uN m rms along n0, m0, k, or an equivalent "
             f"force; it is largest at {largest:.3f} s"
@@ -170,7 +169,7 @@ def proposal(family: Family, gram: Array, before: Array, right: Array) -> Gain:
     """
     size = np.sqrt(np.maximum(before, 1e-300))
     eigenvalues, vectors = np.linalg.eigh(gram / np.outer(size, size))
-    seen = eigenvalues > INVISIBLE
+    seen = eigenvalues > DEPENDENT  # share of the power that is left
     along = vectors[:, seen].T @ (right / size)
     values = vectors[:, seen] @ (along / eigenvalues[seen]) / size
     return Gain(family, float(np.sum(along**2 / eigenvalues[seen])), values)

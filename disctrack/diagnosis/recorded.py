@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from disctrack.discrepancy.significance import SURE
 from disctrack.findings import Finding, Kind, doubts
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_details, read_provenance, read_trajectory
 
 MIN_MISPRINT_UM, MOST_MISPRINT_UM = 4.0, 300.0  # scatter by the shapes of dots; and the largest error of a printer
-MIN_SIGMAS = 5.0
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def with_declared_dots(trajectory: Trajectory, details: Mapping[str, Any]) -> Tr
     if shift.ndim != 2 or shift.shape != sigma.shape or not np.isfinite(shift).all():
         return trajectory
     length = np.linalg.norm(shift, axis=1)
-    off = (length > MIN_MISPRINT_UM) & (length > MIN_SIGMAS * np.linalg.norm(sigma, axis=1))
+    off = (length > MIN_MISPRINT_UM) & (length > SURE * np.linalg.norm(sigma, axis=1))
     if not off.any() or 3 * off.sum() > len(shift) or length.max() >= MOST_MISPRINT_UM:
         return trajectory
     places = trajectory.disc.marker_centres_body.copy()

@@ -21,6 +21,7 @@ from scipy.stats import chi2
 from calibration.kit.arrays import Array, Mask
 from disctrack.diagnosis.stretch import MIN_FRAMES
 from disctrack.discrepancy.noise import THIRD
+from disctrack.discrepancy.significance import SURE
 from disctrack.faults.catalogue import TYPICAL_STEPS
 from disctrack.track.side_by_side import evenly
 from disctrack.trajectory import MarkerStatus, Trajectory
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from disctrack.diagnosis.disc_system import DiscSystem
 
 
-SURE = 4.0  # sigmas by which the scatter from frame to frame has to differ from the stated noise to replace it
 MARGIN = 0.6  # of a field's correlation length, by which its grid exceeds the positions
 DOT_SIGMA = 3e-7  # [m] a common bias of one dot's centre in all images: 1/800 px, below what edges of dots allow
 LENS_LENGTHS = (0.3, 0.6, 0.17)  # correlation lengths of a camera's field, over the extent of the positions

@@ -21,6 +21,7 @@ from scipy.optimize import minimize
 from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.elimination import Own, is_linear, projection
 from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.significance import SURE
 from disctrack.discrepancy.system import System, Transformed
 
 if TYPE_CHECKING:
@@ -79,7 +80,6 @@ def whitened(system: System, fit: Fit) -> System | None:
 
 
 SHORTEST = 40  # samples, below which autocorrelation is not estimated
-SURE = 3.0  # standard deviations of an estimated autocorrelation, below which it is not significant
 
 
 def inflation(system: System, fit: Fit) -> Array:

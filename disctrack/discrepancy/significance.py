@@ -16,6 +16,7 @@ from calibration.kit.arrays import Array
 from disctrack.discrepancy.score import Linearisation, Score, span
 
 FALSE_ALARM = 0.005  # probability that noise alone produces a finding, over all that is tested
+SURE = 3.0  # sigmas, below which one number alone is not significant
 TWO_SIDED = float(stats.norm.isf(0.025))  # sigmas: 95 % between both limits
 
 
