@@ -7,14 +7,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from disctrack.recording.declaration import Recording
 
 pytestmark = pytest.mark.slow
-Benchmark = Any  # the fixture of pytest-benchmark
 
 
 def disctrack(*words: object, **environment: str) -> None:
@@ -26,7 +24,7 @@ def disctrack(*words: object, **environment: str) -> None:
 @pytest.mark.benchmark(group="a command")
 @pytest.mark.parametrize("command", ["run", "run --no-figures --no-video", "analyse", "diagnose"])
 @pytest.mark.parametrize("start", ["first", "later"])
-def test_start(benchmark: Benchmark, recording: Recording, tmp_path: Path, command: str, start: str) -> None:
+def test_start(benchmark, recording: Recording, tmp_path: Path, command: str, start: str) -> None:
     """A first one has nothing compiled."""
     name, *options = command.split()
     disctrack("run", recording.folder, "-o", tmp_path, "--no-figures", "--no-video")

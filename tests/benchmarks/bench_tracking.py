@@ -7,7 +7,6 @@ A round is all pairs. The two limits do what nobody can spare: read every byte, 
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import cv2
 import numba
@@ -26,7 +25,6 @@ OPERATIONS, EVALUATIONS = 210, 4
 ROUNDS = 5
 
 pytestmark = [pytest.mark.slow, pytest.mark.benchmark(group="all pairs of the recording")]
-Benchmark = Any  # the fixture of pytest-benchmark
 
 
 @pytest.fixture(scope="session")
@@ -37,19 +35,19 @@ def trajectory(images: np.ndarray, rig: StereoRig, recording: Recording) -> Traj
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.usefixtures("trajectory")
-def test_measured_from_memory(benchmark: Benchmark, images, rig, recording, threads: int) -> None:
+def test_measured_from_memory(benchmark, images, rig, recording, threads: int) -> None:
     given = images, rig, recording.disc, recording.frame_rate
     benchmark.pedantic(measure_pairs, given, {"threads": threads}, rounds=ROUNDS)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.usefixtures("trajectory")
-def test_measured_from_files(benchmark: Benchmark, pairs: ImagePairs, rig, recording, threads: int) -> None:
+def test_measured_from_files(benchmark, pairs: ImagePairs, rig, recording, threads: int) -> None:
     benchmark.pedantic(measure, (recording, rig, pairs), {"threads": threads}, rounds=ROUNDS)
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_decoding_alone(benchmark: Benchmark, pairs: ImagePairs, threads: int) -> None:
+def test_decoding_alone(benchmark, pairs: ImagePairs, threads: int) -> None:
     names = [str(reader.files[i]) for i in range(len(pairs)) for reader in (pairs.left, pairs.right)]
 
     def decode() -> None:
@@ -60,7 +58,7 @@ def test_decoding_alone(benchmark: Benchmark, pairs: ImagePairs, threads: int) -
     benchmark.pedantic(decode, rounds=ROUNDS)
 
 
-def test_read_alone(benchmark: Benchmark, pairs: ImagePairs, images: np.ndarray) -> None:
+def test_read_alone(benchmark, pairs: ImagePairs, images: np.ndarray) -> None:
     def read() -> None:
         for i, pair in enumerate(images.copy()):
             pairs.left.read(i, pair[0])
@@ -69,12 +67,12 @@ def test_read_alone(benchmark: Benchmark, pairs: ImagePairs, images: np.ndarray)
     benchmark.pedantic(read, rounds=ROUNDS)
 
 
-def test_limit_of_memory(benchmark: Benchmark, images: np.ndarray) -> None:
+def test_limit_of_memory(benchmark, images: np.ndarray) -> None:
     target = images.copy()
     benchmark.pedantic(np.copyto, (target, images), rounds=ROUNDS)
 
 
-def test_limit_of_arithmetic(benchmark: Benchmark, images, trajectory: Trajectory) -> None:
+def test_limit_of_arithmetic(benchmark, images, trajectory: Trajectory) -> None:
     values = np.ones(2048, np.float32)  # stay in the nearest cache
     multiplied_and_added(values, 1)
     operations = len(images) * dot_pixels(trajectory) * OPERATIONS * EVALUATIONS
@@ -104,7 +102,7 @@ def dot_pixels(trajectory: Trajectory) -> float:
     return float(np.median(found))
 
 
-def test_plain_opencv_and_scipy(benchmark: Benchmark, images, rig, recording, trajectory: Trajectory) -> None:
+def test_plain_opencv_and_scipy(benchmark, images, rig, recording, trajectory: Trajectory) -> None:
     """What one writes in an afternoon: threshold, contours, moments, least squares per frame; start pose given."""
     R = rotation_from_quaternion(trajectory.quaternion[0])
     start = np.concatenate([trajectory.q[0, :3], vector_from_rotation(R)])

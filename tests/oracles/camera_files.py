@@ -76,6 +76,8 @@ def write_mraw(stem: Path, images: np.ndarray, bits: int, *, kind: str = "cih", 
 
 
 TRIGGER = (0x40000000 | 1, 1_700_000_000)  # a quarter second after the whole one; lowest bit: no common time signal
+CINE = {"first_image": -3, "rate": 2000, "exposure_ns": 50_000, "trigger": TRIGGER, "notes": (8,), "setup_bytes": 12432}
+SETUP_AT = 44 + 40  # behind the headers of the file and of the bitmap
 
 
 def write_cine(
@@ -84,44 +86,26 @@ def write_cine(
     bits: int,
     *,
     packed_pixels: bool = False,
-    first_image: int = -3,
-    rate: int = 2000,
-    exposure_ns: int = 50_000,
     times: np.ndarray | None = None,
-    trigger: tuple[int, int] = TRIGGER,
-    notes: tuple[int, ...] = (8,),
-    compression: int = 0,
-    packing: int | None = None,
-    setup_bytes: int = 12432,
-    **setup: int,
+    **entries,
 ) -> Path:
     """Write images (n, height, width) of stored codes as a cine; returns the file.
 
     bits : 8, 16, or 10 to 16 in 16; with packed_pixels 10 or 12. times (n,) [s] after the trigger, None: at the rate.
-    notes : bytes in front of each image, taken in turn. setup : further fields by their offset, s808=3 for one.
+    entries : in place of those of CINE; notes : bytes in front of each image, taken in turn.
     """
-    n, height, width = images.shape
+    told, (n, height, width) = CINE | entries, images.shape
+    first, trigger, notes = told["first_image"], told["trigger"], told["notes"]
     if packed_pixels:
-        pictures = [packed(image, bits) for image in images]
+        packing, pictures = {10: 256, 12: 1024}[bits], [packed(image, bits) for image in images]
     else:  # a bitmap's rows begin with the lowest
-        pictures = [image[::-1].astype("u1" if bits == 8 else "<u2").tobytes() for image in images]
-    if packing is None:
-        packing = {10: 256, 12: 1024}[bits] if packed_pixels else 0
-    block = bytearray(setup_bytes)
-    fields = {0: ("H", min(rate, 65535)), 737: ("H", width), 739: ("H", height), 743: ("I", 12345), 768: ("I", rate)}
-    fields |= {772: ("I", exposure_ns // 1000), 792: ("I", 711), 896: ("I", bits), 1568: ("I", exposure_ns)}
-    fields |= {5732: ("i", 0), 5736: ("i", (1 << bits) - 1)} | {int(key[1:]): ("I", v) for key, v in setup.items()}
-    for offset, (kind, value) in fields.items():
-        if offset + struct.calcsize(kind) <= setup_bytes:
-            struct.pack_into("<" + kind, block, offset, value)
-    struct.pack_into("<2sH", block, 140, b"ST", setup_bytes)
-    setup_at = 44 + 40
-    times = (first_image + np.arange(n)) / rate if times is None else times
+        packing, pictures = 0, [image[::-1].astype("u1" if bits == 8 else "<u2").tobytes() for image in images]
+    times = (first + np.arange(n)) / told["rate"] if times is None else times
     fixed_point = np.rint((trigger[0] & ~3) + np.asarray(times, float) * 2**32).astype(np.int64) + (trigger[1] << 32)
     stamps = b"".join(struct.pack("<II", t & 0xFFFFFFFC | trigger[0] & 3, t >> 32) for t in fixed_point.tolist())
     blocks = struct.pack("<IHH", 8 + 4 * n, 1003, 0) + bytes(4 * n)
     blocks += struct.pack("<IHH", 8 + len(stamps), 1002, 0) + stamps
-    table_at = setup_at + setup_bytes + len(blocks)
+    table_at = SETUP_AT + told["setup_bytes"] + len(blocks)
     records, table, position = b"", [], table_at + 8 * n
     for i, picture in enumerate(pictures):
         note = notes[i % len(notes)]
@@ -129,13 +113,25 @@ def write_cine(
         record = struct.pack("<I", note) + bytes(note - 8) + struct.pack("<I", len(picture)) + picture
         records += record
         position += len(record)
-    head = struct.pack(
-        "<2sHHHiIiIIII", b"CI", 44, compression, 1, first_image, n, first_image, n, 44, setup_at, table_at
-    )
+    head = struct.pack("<2sHHHiIiIIII", b"CI", 44, 0, 1, first, n, first, n, 44, SETUP_AT, table_at)
     head += struct.pack("<II", *trigger)
-    bitmap = struct.pack(
-        "<IiiHHIIiiII", 40, width, height, 1, 8 if bits == 8 else 16, packing, len(pictures[0]), 0, 0, 0, 0
-    )
+    depth = 8 if bits == 8 else 16
+    bitmap = struct.pack("<IiiHHIIiiII", 40, width, height, 1, depth, packing, len(pictures[0]), 0, 0, 0, 0)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(head + bitmap + block + blocks + struct.pack(f"<{n}q", *table) + records)
+    setup = setup_of(told, bits, width, height)
+    path.write_bytes(head + bitmap + setup + blocks + struct.pack(f"<{n}q", *table) + records)
     return path
+
+
+def setup_of(told: dict, bits: int, width: int, height: int) -> bytes:
+    """What a cine keeps of the camera's settings; an older one ends before the newer fields."""
+    size, rate, exposure_ns = told["setup_bytes"], told["rate"], told["exposure_ns"]
+    block = bytearray(size)
+    fields = {0: ("H", min(rate, 65535)), 737: ("H", width), 739: ("H", height), 743: ("I", 12345), 768: ("I", rate)}
+    fields |= {772: ("I", exposure_ns // 1000), 792: ("I", 711), 896: ("I", bits), 1568: ("I", exposure_ns)}
+    fields |= {5732: ("i", 0), 5736: ("i", (1 << bits) - 1)}
+    for offset, (kind, value) in fields.items():
+        if offset + struct.calcsize(kind) <= size:
+            struct.pack_into("<" + kind, block, offset, value)
+    struct.pack_into("<2sH", block, 140, b"ST", size)
+    return bytes(block)

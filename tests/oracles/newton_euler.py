@@ -176,8 +176,12 @@ def accelerations(disc, state, regime):
     return solution[:3], solution[3:6], solution[6:], now
 
 
-def state_from_angles(disc, x, y, psi, theta, phi, thetadot, omega2, omega3, velocity=None):
-    """State of a disc in contact; rolling unless the horizontal velocity of O is given."""
+def state_from_angles(disc, coordinates, velocity=None):
+    """State of a disc in contact at (x, y, psi, theta, phi, thetadot, omega2, omega3).
+
+    velocity : horizontal one of O; None: the disc rolls
+    """
+    x, y, psi, theta, phi, thetadot, omega2, omega3 = coordinates
     attitude = Rotation.from_euler("ZXZ", [psi, theta, phi])
     R = attitude.as_matrix()
     e1 = np.array([np.cos(psi), np.sin(psi), 0])
@@ -242,11 +246,11 @@ def filmed_motion(disc, theta_deg, omega3, duration, rate, psi=0.7):
     theta = np.radians(theta_deg)
     omega2 = np.sqrt(4 * 9.81 * np.sin(theta) / disc.r)  # thin disc, centre at rest
     start = (0.032, 0.02, psi, theta, -0.4, 0.0, omega2, omega3)
-    state = state_from_angles(disc, *start)
+    state = state_from_angles(disc, start)
     times = np.arange(0.0, duration + 2 * LEAD, 1.0 / (SAMPLES * rate))
     if disc.gives_way:
         disc.table = yielding(disc, state, times)
-        state = state_from_angles(disc.at(0.0), *start)
+        state = state_from_angles(disc.at(0.0), start)
     answer = follow(disc, state, times, rtol=1e-10, atol=1e-11, method="LSODA")
     assert answer.success
     return course(disc, times - LEAD, answer.y)

@@ -334,7 +334,8 @@ def motion(unknown: Unknown):
     regime = "rolling" if unknown.friction is None else "slipping"
     theta = np.radians(unknown.theta_deg)
     omega2 = np.sqrt(4 * 9.81 * np.sin(theta) / body.r)
-    state = newton_euler.state_from_angles(body, 0.032, 0.02, 0.7, theta, -0.4, 0.0, omega2, unknown.omega3)
+    start = (0.032, 0.02, 0.7, theta, -0.4, 0.0, omega2, unknown.omega3)
+    state = newton_euler.state_from_angles(body, start)
     state[9] -= unknown.wears * np.sin(theta)  # the centre sinks with the radius
     if regime == "slipping":
         state[7:9] += (5e-3, -3e-3)

@@ -137,7 +137,7 @@ def test_slip_ends_where_an_independent_integration_ends_it_and_rolling_goes_on(
     motion = rolling.simulate(slippery(mu), state, 0.15)
     assert [s.after for s in motion.switches] == [Regime.ROLLING]
     oracle = newton_euler.Disc(mu=mu)
-    start = newton_euler.state_from_angles(oracle, *state.array[:8], velocity=state.array[8:])
+    start = newton_euler.state_from_angles(oracle, state.array[:8], velocity=state.array[8:])
 
     def slip_left(t, y):
         return np.linalg.norm(newton_euler.Instant(oracle, y).v_contact) - 1e-6

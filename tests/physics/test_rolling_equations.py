@@ -121,7 +121,7 @@ def test_accelerations_and_forces_agree_with_the_world_vector_system(name, regim
             state = random_state(rng, np.radians(rng.uniform(12, 85)))
             state = state.moved(x=0.05 * state.x, y=0.05 * state.y)
         velocity = None if regime == "rolling" else rng.normal(size=2)
-        start = newton_euler.state_from_angles(oracle, *state.array, velocity)
+        start = newton_euler.state_from_angles(oracle, state.array, velocity)
         if regime != "rolling":
             state = state.moved(v_x=velocity[0], v_y=velocity[1])
         if regime == "flying":
@@ -155,7 +155,7 @@ def test_motion_agrees_with_the_world_vector_integration(name):
     )
     times = np.linspace(0, 0.25, 26)
     motion = rolling.simulate(model, state, times=times)
-    solution = newton_euler.follow(oracle, newton_euler.state_from_angles(oracle, *state.array), times)
+    solution = newton_euler.follow(oracle, newton_euler.state_from_angles(oracle, state.array), times)
     expected = newton_euler.coordinates(oracle, solution.y)
     assert_allclose(motion.q[:, :3], expected[:, :3], atol=tolerance)
     assert_allclose(motion.q[:, 3:], expected[:, 3:], atol=tolerance * 30)
@@ -174,7 +174,7 @@ def test_a_table_that_gives_way_follows_the_load_of_the_rigid_one(slip, c):
         v_x, v_y = rolling.simulate(rigid, start, times=[0.0]).qdot[0, :2] + slip
         start, rigid, oracle.mu = start.moved(v_x=v_x, v_y=v_y), rigid.with_effects(CATALOGUE["slip"](mu=0.3)), 0.3
         regime, fine, most = "slipping", fine[:201], 0.01
-    begin = lambda: newton_euler.state_from_angles(oracle.at(0.0), *start.array[:8], start.array[8:] if slip else None)  # noqa: E731
+    begin = lambda: newton_euler.state_from_angles(oracle.at(0.0), start.array[:8], start.array[8:] if slip else None)  # noqa: E731
     q = lambda: newton_euler.coordinates(oracle, newton_euler.follow(oracle, begin(), fine[::40], regime).y)  # noqa: E731
     of_rigid = q()
     oracle.gives_way = c
@@ -200,7 +200,7 @@ def test_a_contact_that_creeps_is_one_that_slips_on_a_film(c, most):
         psi=0.3
     )
     oracle = newton_euler.Disc(laws=[KM_LAW], com_body=COM, friction=lambda speed: speed / c)
-    state = newton_euler.state_from_angles(oracle, *start.array)
+    state = newton_euler.state_from_angles(oracle, start.array)
     force = newton_euler.accelerations(oracle, state, "rolling")[2]
     state[7:9] -= c * force[:2] / force[2]
     times = np.linspace(0.0, 0.3, 301)

@@ -19,8 +19,6 @@ from disctrack.first_look.sequences import find_sequences, pair_cameras
 from disctrack.first_look.targets import PAPERS_MM, board_figure, dots_figure
 from tests.pipeline.conftest import linked
 
-DPI = 150
-
 
 @pytest.mark.statistical
 def test_init_finds_cameras_views_and_board_and_leaves_only_what_no_file_tells(sample_clip, tmp_path, cli):
@@ -123,12 +121,12 @@ def test_stacks_in_one_hdf5_file_are_the_two_cameras(tmp_path, rng):
     assert written["cameras"] == {"frame_rate_hz": 2000.0, "left": "frames.h5:/left", "right": "frames.h5:/right"}
 
 
-def drawn(figure):
+def drawn(figure, dpi=150):
     """Grey values of a sheet, and pixels per millimetre."""
-    figure.set_dpi(DPI)
+    figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    return cv2.cvtColor(np.asarray(canvas.buffer_rgba())[..., :3].copy(), cv2.COLOR_RGB2GRAY), DPI / 25.4
+    return cv2.cvtColor(np.asarray(canvas.buffer_rgba())[..., :3].copy(), cv2.COLOR_RGB2GRAY), dpi / 25.4
 
 
 @pytest.mark.statistical

@@ -130,7 +130,7 @@ def test_views_of_two_files_must_pair_up_and_not_be_a_whole_recording(tmp_path, 
         find_views("left.cih", "right.cih", tmp_path)
 
 
-FRAMES, VIEWS, SIZE = 24, 18, 272
+FRAMES, SIZE = 24, 272
 HALVES = f"left_part = [0, 0, {SIZE}, {SIZE}]\nright_part = [{SIZE}, 0, {SIZE}, {SIZE}]"
 
 
@@ -152,7 +152,7 @@ def declaration(sample_clip: Path, parts: str = HALVES) -> str:
 def halves(sample_clip, tmp_path_factory):
     """The sample recording's first frames and its views, left and right side by side in one image."""
     folder = tmp_path_factory.mktemp("halves")
-    for source, target, n in ((sample_clip, "frames", FRAMES), (sample_clip / "calibration", "views", VIEWS)):
+    for source, target, n in ((sample_clip, "frames", FRAMES), (sample_clip / "calibration", "views", None)):
         (folder / target).mkdir()
         for left in sorted((source / "left").glob("*.png"))[:n]:
             both = [cv2.imread(str(f), cv2.IMREAD_UNCHANGED) for f in (left, source / "right" / left.name)]

@@ -13,7 +13,7 @@ from disctrack.recording.readers import FrameReader, open_frames
 from disctrack.recording.readers.cine import linear_from_10_bits
 from disctrack.recording.readers.same_instants import check_headers, check_time_stamps
 from tests.disctrack.recording.readers.written import assert_refused, lost_of
-from tests.oracles.camera_files import TRIGGER, write_cine, write_mraw
+from tests.oracles.camera_files import SETUP_AT, TRIGGER, write_cine, write_mraw
 
 
 def random_codes(rng, bits: int, n: int = 7, height: int = 24, width: int = 32) -> np.ndarray:
@@ -57,10 +57,10 @@ def pair(folder: Path, rng, kind: str, left=None, right=None) -> list[FrameReade
         ("cih", {"Total_Frame": "1" + "0" * 14}, "cut short"),
         ("cih", {"Total_Frame": "9" * 5000}, "expected a whole number"),
         ("cih", {"Record_Rate": "nan"}, "expected a number above 0"),
-        ("cine", {"compression": 1}, "compressed cine"),
-        ("cine", {"s808": 3}, "colour recording"),
-        ("cine", {"s808": 0x80000003}, "colour recording"),
-        ("cine", {"packing": 512}, "biCompression 512"),
+        ("cine", {"at": (4, "H", 1)}, "compressed cine"),
+        ("cine", {"at": (SETUP_AT + 808, "I", 3)}, "colour recording"),
+        ("cine", {"at": (SETUP_AT + 808, "I", 0x80000003)}, "colour recording"),
+        ("cine", {"at": (60, "I", 512)}, "biCompression 512"),
         ("cine", {"rate": 0, "times": np.arange(7.0)}, "no frame rate"),
         # hostile headers, before anything is made of their sizes
         ("cine", {"at": (0, "2s", b"XX")}, "not a cine file"),
@@ -271,10 +271,14 @@ def test_a_recording_of_which_every_tenth_frame_was_saved_has_a_tenth_of_the_rat
     assert "9000 Hz (90000 Hz, one frame in 10 saved)" in header.sentence()
 
 
-@pytest.mark.parametrize("written", [{"notes": (8, 24, 4096)}, {"s808": 0x80000000}, {"setup_bytes": 1200}])
-def test_notes_of_any_length_a_grey_head_of_a_colour_camera_and_an_older_setup_are_read(tmp_path, rng, written):
+@pytest.mark.parametrize(
+    ("written", "grey_head"), [({"notes": (8, 24, 4096)}, 0), ({}, 0x80000000), ({"setup_bytes": 1200}, 0)]
+)
+def test_notes_of_any_length_a_grey_head_of_a_colour_camera_and_an_older_setup_are_read(
+    tmp_path, rng, written, grey_head
+):
     codes = random_codes(rng, 8)
-    write_cine(tmp_path / "left.cine", codes, 8, **written)
+    overwrite(write_cine(tmp_path / "left.cine", codes, 8, **written), SETUP_AT + 808, "I", grey_head)
     assert lost_of(opened(tmp_path), codes) == {}
     exposure = opened(tmp_path).header.exposure
     assert exposure == pytest.approx(50e-6)  # an older setup has it in microseconds
