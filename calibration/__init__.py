@@ -20,13 +20,11 @@ if TYPE_CHECKING:
     from calibration.fit.refinement import refine_stereo as refine_stereo
     from calibration.fit.stereo_model import Observations as Observations
     from calibration.fit.stereo_model import StereoModel as StereoModel
-    from calibration.fit.stereo_model import Terms as Terms
     from calibration.judge.tolerances import BoardTolerances as BoardTolerances
     from calibration.kit.errors import CalibrationError as CalibrationError
     from calibration.kit.errors import DiscTrackError as DiscTrackError
     from calibration.kit.errors import RigFileError as RigFileError
     from calibration.points import calibrate_from_points as calibrate_from_points
-    from calibration.stereo import CalibrationSettings as CalibrationSettings
     from calibration.stereo import StereoCalibration as StereoCalibration
     from calibration.stereo import calibrate_from_corners as calibrate_from_corners
     from calibration.stereo import calibrate_stereo as calibrate_stereo

@@ -9,9 +9,10 @@ from numpy.typing import ArrayLike
 from calibration.board.chessboard import BoardNotFound, CornerView
 from calibration.board.target import Board
 from calibration.cameras.camera import CAMERA_NAMES
+from calibration.judge.tolerances import BoardTolerances
 from calibration.kit.arguments import Thickness, checked
 from calibration.kit.errors import CalibrationError
-from calibration.stereo import CalibrationSettings, StereoCalibration, calibrate_from_corners
+from calibration.stereo import StereoCalibration, calibrate_from_corners
 
 LARGEST_SQUARE = 0.5  # m: above, the value was given in millimetres
 OVERSTATED = 0.7  # scatter of corners over the declared sigma, below which the sigma is too large
@@ -25,7 +26,7 @@ def calibrate_from_points(
     board: Board,
     image_size: tuple[int, int] | tuple[tuple[int, int], tuple[int, int]],
     sigma_px: float,
-    settings: CalibrationSettings | None = None,
+    tolerances: BoardTolerances | None = None,
     table_view: int | None = None,
     board_thickness: Thickness = 0.0,
 ) -> StereoCalibration:
@@ -56,7 +57,7 @@ def calibrate_from_points(
         ]
         for side, size, name in zip((left, right), sizes, CAMERA_NAMES, strict=True)
     ]
-    found = calibrate_from_corners(views[0], views[1], board, settings, table_view, board_thickness)
+    found = calibrate_from_corners(views[0], views[1], board, tolerances, table_view, board_thickness)
     shown = sigma_px * float(np.sqrt(found.refinement.chi_square))
     if shown < OVERSTATED * sigma_px:
         note = f"the corners scatter by {shown:.3g} px, {sigma_px:g} px were declared: the stated sigmas are too large"

@@ -103,18 +103,11 @@ Record = dict[str, Any]
 def record_of(calibration: StereoCalibration) -> Record:
     """The record of a calibration, without the images."""
     r = calibration.refinement
-    tried = ("n_parameters", "rms_px", "held_out_rms_px", "held_out_chi_square", "noise_px")
     figures = {
         "rms_px": calibration.rms_px,
         "rms_per_camera_px": list(calibration.rms_per_camera_px),
-        "distortion_terms": r.terms.distortion,
-        "board_model": r.terms.board,
         "iterations": r.iterations,
         "converged": r.converged,
-        "cross_validation": [
-            {"distortion": c.terms.distortion, "board": c.terms.board, **{name: getattr(c, name) for name in tried}}
-            for c in calibration.candidates
-        ],
         "assessment": asdict(calibration.assessment),
     }
     model, seen = r.model, r.observations
@@ -123,7 +116,7 @@ def record_of(calibration: StereoCalibration) -> Record:
     place[apart] = len(place) + np.arange(len(apart))
     R, t = (np.concatenate([of[:, 0], of[apart, 1]]) for of in (model.R_left_board, model.t_left_board))
     document = {
-        "settings": asdict(calibration.settings),
+        "settings": {"tolerances": asdict(calibration.tolerances)},
         "figures": figures,
         "versions": versions(("disctrack", "numpy", "scipy", "opencv-contrib-python-headless", "numba", "h5py")),
         **{name: getattr(calibration, name) for name in ("doubts", "warnings", "rejected_views", "view_names")},

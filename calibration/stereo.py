@@ -11,19 +11,20 @@ from calibration.board.chessboard import BoardNotFound, CornerView, negatives
 from calibration.board.search import Progress, located
 from calibration.board.target import Board, Target
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig
+from calibration.cameras.splines import LensField
+from calibration.fit.board_motion import BoardMotion
+from calibration.fit.lens_field import fit_lens_field
 from calibration.fit.pairing import FLOOR, MIN_VIEWS, Names, Pairs, Views, count_once
-from calibration.fit.refinement import Refinement, TermsTried
+from calibration.fit.refinement import Refinement, refine_stereo
 from calibration.fit.start import start_stereo, too_wide
-from calibration.fit.stereo_model import BOARD_MODELS, RICHEST, Observations, Terms
+from calibration.fit.stereo_model import Observations
 from calibration.judge.assessment import Assessment, assess, stereo_covariance
-from calibration.judge.pairs import camera_moved, compared, motion_between_exposures, zoomed
+from calibration.judge.pairs import PairMotion, camera_moved, compared, judge_pairs, motion_between_exposures, zoomed
 from calibration.judge.tolerances import (
-    BoardShape,
     BoardTolerances,
     board_shape,
     on_the_table,
     rig_with_covariance,
-    shape_left_out,
     with_tolerances,
 )
 from calibration.kit.arguments import Thickness, checked
@@ -32,24 +33,8 @@ from calibration.kit.brief import Brief
 from calibration.kit.errors import CalibrationError
 from calibration.kit.stuck_pixels import repaired_views
 from calibration.kit.threads import one_blas_thread
-from calibration.stereo_fit import JointFit, fit_jointly
 
-LEAST_SEEN = 12  # images of every point of the target, to refine its position: with few pairs it would fit their errors
 Image = tuple[str, str]  # name of an unused image, and the reason
-
-
-@checked
-@dataclass(frozen=True)
-class CalibrationSettings:
-    """Options of a calibration."""
-
-    distortion: str = "auto"  # all terms, with priors; or one of stereo_model.DISTORTION_MODELS
-    board: str = "auto"  # selected by held-out error; or one of stereo_model.BOARD_MODELS
-    tolerances: BoardTolerances = field(default_factory=BoardTolerances)
-
-    def __post_init__(self) -> None:
-        free = RICHEST if self.distortion == "auto" else self.distortion
-        Terms(free, "flat" if self.board == "auto" else self.board)  # raises CalibrationError for unknown names
 
 
 @dataclass(frozen=True, repr=False)
@@ -59,12 +44,11 @@ class StereoCalibration(Brief):
     rig: StereoRig  # with covariance (30, 30)
     refinement: Refinement  # observations, residuals, which were kept
     board: Target
-    settings: CalibrationSettings
+    tolerances: BoardTolerances
     table_view: int | None
     board_thickness: float  # [m]
     view_names: tuple[tuple[str, str], ...]  # (n_views,) left and right name
     corner_views: tuple[tuple[CornerView | BoardNotFound, ...], tuple[CornerView | BoardNotFound, ...]]
-    candidates: tuple[TermsTried, ...]  # cross-validation table; the chosen terms are refinement.terms
     assessment: Assessment
     warnings: tuple[str, ...] = field(default=())
     doubts: tuple[str, ...] = ()  # reasons for which errors of the rig may exceed its sigmas
@@ -93,7 +77,7 @@ class StereoCalibration(Brief):
 
     @property
     def board_points(self) -> Array:
-        """(n, 3) [m] as refined; the declared ones if the board is assumed to be flat."""
+        """(n, 3) [m] as refined."""
         return self.refinement.model.points
 
     @property
@@ -142,7 +126,7 @@ def calibrate_stereo(
     left_images: Sequence[NDArray],
     right_images: Sequence[NDArray],
     board: Target,
-    settings: CalibrationSettings | None = None,
+    tolerances: BoardTolerances | None = None,
     table_view: int | None = None,
     board_thickness: Thickness = 0.0,
     names: Sequence[tuple[str, str]] | None = None,
@@ -168,7 +152,7 @@ def calibrate_stereo(
         repaired_views(side, name) for side, name in zip((left_images, right_images), CAMERA_NAMES, strict=True)
     )
     views, n = located([*left, *right], board, progress), len(left_images)
-    found = calibrate_from_corners(views[:n], views[n:], board, settings, table_view, board_thickness, names)
+    found = calibrate_from_corners(views[:n], views[n:], board, tolerances, table_view, board_thickness, names)
     seen = [view for side in found.corner_views for view in side]
     negative = negatives([*left, *right], seen, board) if isinstance(board, Board) else ""
     notes = filter(None, (note_left, note_right))
@@ -207,13 +191,13 @@ def calibrate_from_corners(
     left_views: Sequence[CornerView | BoardNotFound],
     right_views: Sequence[CornerView | BoardNotFound],
     board: Target,
-    settings: CalibrationSettings | None = None,
+    tolerances: BoardTolerances | None = None,
     table_view: int | None = None,
     board_thickness: Thickness = 0.0,
     names: Sequence[tuple[str, str]] | None = None,
 ) -> StereoCalibration:
     """`calibrate_stereo` from located corners."""
-    settings = settings or CalibrationSettings()
+    tolerances = tolerances or BoardTolerances()
     names = tuple(names or [(f"left {i}", f"right {i}") for i in range(len(left_views))])
     views = (list(left_views), list(right_views))
     count_once(views, names, table_view)
@@ -226,30 +210,25 @@ def calibrate_from_corners(
         for camera, why in lenses.items():
             for v in start.others:
                 views[camera][v] = BoardNotFound(why)
-        return calibrate_from_corners(*views, board, settings, table_view, board_thickness, names)
-    seen = np.bincount(observations.point, minlength=len(board.points))
-    shapes = BOARD_MODELS if seen.min() >= LEAST_SEEN else BOARD_MODELS[:-1]  # without free points if too few
-    distortion = RICHEST if settings.distortion == "auto" else settings.distortion
-    tried = [Terms(distortion, shape) for shape in (shapes if settings.board == "auto" else (settings.board,))]
-    fit = fit_jointly(observations, start, board.points, tried, table_view)
+        return calibrate_from_corners(*views, board, tolerances, table_view, board_thickness, names)
+    fit = _fit_jointly(observations, start, board.points, table_view)
     for (v, camera), why in fit.pairs.bad_images.items():
         views[camera][v] = BoardNotFound(why)
     apart = _warnings_of_pairs(fit, names, table_view)
     _require_fitted(fit, _not_used(views, names), apart, wide, table_view)
-    rig, assessment, shape_note = _judged(fit, board, shapes, settings, table_view, board_thickness, wide)
+    rig, assessment = _judged(fit, board, tolerances, table_view, board_thickness, wide)
     return StereoCalibration(
         rig=rig,
         refinement=fit.refinement,
         board=board,
-        settings=settings,
+        tolerances=tolerances,
         table_view=table_view,
         board_thickness=board_thickness,
         view_names=names,
         corner_views=(tuple(views[0]), tuple(views[1])),
         apart=tuple(sorted(fit.pairs.apart)),
-        candidates=fit.candidates,
         assessment=assessment,
-        warnings=(*_used_alone(views, names), *notes, *apart, *shape_note, *assessment.warnings),
+        warnings=(*_used_alone(views, names), *notes, *apart, *assessment.warnings),
     )
 
 
@@ -268,38 +247,73 @@ def _begin(views: Views, board: Target, names: Names) -> tuple[Pairs, list[str]]
     return start, [*notes, _choice_of_origin(board)]
 
 
+@dataclass(frozen=True)
+class _JointFit:
+    """Result of `_fit_jointly`."""
+
+    refinement: Refinement  # of the observations, corrected by the lens field if there is one
+    lens_field: LensField | None
+    pairs: Pairs
+    motion: PairMotion | None  # of the boards between the exposures
+
+
+def _fit_jointly(observations: Observations, start: Pairs, nominal: Array, table_view: int | None) -> _JointFit:
+    """Refine, test the pairs with the result, and refine again; then estimate motion of boards and the lens field.
+
+    start : from rough cameras, which are best to detect that a camera was moved, as no pair has biased them
+    table_view : determines the stereo pose if a camera was moved
+    """
+    # rough poses may be wrong by degrees: odd pairs are tested again with refined cameras
+    used = replace(start, odd={}) if start.steps else start
+
+    def refined(by: Pairs, motion: BoardMotion | None = None) -> Refinement:
+        return refine_stereo(observations, by.joined(observations), nominal, motion=motion)
+
+    refinement = refined(used)
+    # once is enough: images have separate poses of the board, and cameras without bad pairs give the same result
+    pairs = judge_pairs(observations, refinement, table_view)
+    if pairs.apart != used.apart or pairs.bad_images:
+        for view, camera in pairs.bad_images:
+            observations = observations[(observations.view != view) | (observations.camera != camera)]
+        used = pairs
+        refinement = refined(used)
+    found, (field, corrected) = motion_between_exposures(refinement), fit_lens_field(refinement)
+    motion = found and found[0]
+    likely = motion is not None and motion.is_likely
+    if found is not None and motion is not None and likely and field is not None:
+        # an (incomplete) lens field moves boards differently in each camera, too: use the scatter before it
+        left, _ = motion_between_exposures(corrected) or found
+        motion = replace(left, scatter=max(motion.scatter, left.scatter))
+        likely = motion.is_seen
+    if motion is not None and likely:
+        refinement = refined(used, motion.as_random(nominal))
+        field, corrected = fit_lens_field(refinement)
+    return _JointFit(corrected, field, pairs, motion)
+
+
 def _judged(
-    fit: JointFit,
+    fit: _JointFit,
     board: Target,
-    shapes: tuple[str, ...],
-    settings: CalibrationSettings,
+    tolerances: BoardTolerances,
     table_view: int | None,
     board_thickness: float,
     wide: Sequence[tuple[str, str]],
-) -> tuple[StereoRig, Assessment, list[str]]:
-    """The rig with its covariance, its assessment, and a warning if the board has another shape than the refined one.
-
-    shapes : board models that the views determine
-    """
-    refinement, note = fit.refinement, []
+) -> tuple[StereoRig, Assessment]:
+    """The rig with its covariance, and its assessment."""
+    refinement = fit.refinement
     inflation = max(refinement.disagreement, 1.0)
     shape = board_shape(refinement, board.points, inflation)
     moved = None if refinement.problem.motion else motion_between_exposures(refinement)
     covariance = stereo_covariance(refinement, moved and moved[1])
-    if refinement.terms.board in shapes:
-        left_out, sigmas = shape_left_out(refinement, board.points, shapes, inflation)
-        covariance, note = covariance + left_out, [_other_shape(settings.board, shape, sigmas)] if sigmas > 1.0 else []
     origin = on_the_table(board.points, shape)
     rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, covariance, origin)
     rig = replace(rig, lens_field=fit.lens_field)
-    with_board = with_tolerances(rig, board.points, table_view, board_thickness, settings.tolerances, shape)
-    chosen = next(row for row in fit.candidates if row.terms == refinement.terms)
-    assessment = assess(refinement, chosen, rig, with_board, table_view, inflation, fit.motion, wide)
-    return with_board, assessment, note
+    with_board = with_tolerances(rig, board.points, table_view, board_thickness, tolerances, shape)
+    return with_board, assess(refinement, rig, with_board, table_view, inflation, fit.motion, wide)
 
 
 def _require_fitted(
-    fit: JointFit,
+    fit: _JointFit,
     not_used: dict[int, list[Image]],
     apart: Sequence[str],
     wide: Sequence[tuple[str, str]],
@@ -402,7 +416,7 @@ def _choice_of_origin(board: Target) -> str:
     )
 
 
-def _warnings_of_pairs(fit: JointFit, names: Names, table_view: int | None) -> list[str]:
+def _warnings_of_pairs(fit: _JointFit, names: Names, table_view: int | None) -> list[str]:
     """Warnings about pairs whose images are used separately, each for its own camera."""
     moved = [camera_moved(fit.pairs, names, table_view)] if fit.pairs.steps else []
     apart = {v: why for v, why in fit.pairs.odd.items() if v not in fit.pairs.others}
@@ -416,15 +430,3 @@ def _warnings_of_pairs(fit: JointFit, names: Names, table_view: int | None) -> l
         "exposures, or they are not a pair. Each image is used for its own camera, none of them for how the cameras "
         "stand to each other",
     ]
-
-
-def _other_shape(board: str, shape: BoardShape, sigmas: float) -> str:
-    """A warning about a board that has another shape than the refined one."""
-    taken, do = (
-        (f"{board}, requested,", ": leave its shape to the views (board auto)") if board != "auto" else ("simple", "")
-    )
-    return (
-        f"the board was taken as {taken} but the views show another shape (longer by {100 * abs(shape.stretch):.2g} % "
-        f"along one side, bent by {1e6 * abs(shape.lift):.0f} µm, or misprinted): cameras are pulled by up to "
-        f"{sigmas:.1f} of their sigmas. The sigmas contain that{do}"
-    )

@@ -1,7 +1,7 @@
 """Fit of the lens field, a smooth displacement of the image beyond the distortion polynomial, to views of the board.
 
 The coefficients of the splines (`splines`) have a normal prior. Cameras, poses and the board's shape are refined with
-them and have no prior here, so that the field describes only what these cannot. It is the sum of a field that is smooth
+them, with the priors that they have without a field. It is the sum of a field that is smooth
 over two cells of its grid, and of a smaller one that varies within a cell. The sizes of both maximise the marginal
 likelihood of all views (MacKay 1992), not the held-out error: a held-out view at the edge of the image covers an area
 that no other view covers. The field is kept if it reduces the held-out error.
@@ -16,7 +16,7 @@ import scipy
 
 from calibration.cameras.splines import LensField
 from calibration.fit.pairing import GOOD_VIEWS
-from calibration.fit.refinement import FOLDS, Refinement, refine_stereo
+from calibration.fit.refinement import FOLDS, Refinement, refined
 from calibration.fit.stereo_model import Observations
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import eliminate
@@ -27,12 +27,10 @@ SIZES_PX = ((0.003, 0.01), (0.003, 0.03), (0.01, 0.03), (0.01, 0.1), (0.03, 0.1)
 BETTER = 2.5  # standard errors by which the held-out chi-square must decrease
 
 
-def fit_lens_field(refinement: Refinement, nominal: Array) -> tuple[LensField | None, Refinement]:
+def fit_lens_field(refinement: Refinement) -> tuple[LensField | None, Refinement]:
     """The field of both lenses, and the refinement of the observations corrected by it.
 
     None, and the unchanged refinement, if a field does not reduce the held-out error.
-
-    nominal : (n, 3) [m] the target's points as declared
     """
     used = refinement.observations[refinement.kept]
     views = np.unique(used.view)
@@ -45,6 +43,8 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> tuple[LensField | 
     priors = [_precision(field, *sizes) for sizes in SIZES_PX]
     of_views = [_rows_of(refinement, used[used.view == view], field) for view in views]
     total = np.sum([rows.T @ rows for rows in of_views], axis=0)
+    known = np.append(np.arange(len(refinement.normal.prior) - 1), -1)
+    total[known[:, None], known] += refinement.normal.prior
     solution, prior = _most_likely(total, priors)
     others = np.append(np.arange(len(solution) - field.coefficients.size), len(solution))
     chi_square = np.zeros((2, len(views)))  # held-out, of each view: without a field, and with one
@@ -61,7 +61,8 @@ def fit_lens_field(refinement: Refinement, nominal: Array) -> tuple[LensField | 
     o = refinement.observations
     moved = np.stack([field.displacement(o.pixels, camera) for camera in (0, 1)])[o.camera, np.arange(len(o))]
     corrected = replace(o, pixels=o.pixels - moved)
-    return field, refine_stereo(corrected, refinement.model, nominal, refinement.terms, begin=refinement)
+    problem, extra = replace(refinement.problem, observations=corrected), refinement.unexplained_sigma**2
+    return field, refined(problem, refinement.model, refinement.kept, extra)
 
 
 def _precision(grid: LensField, sigma: float, smooth: float) -> Array:

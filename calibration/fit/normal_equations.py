@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.fit.board_motion import BoardMotion, motions
-from calibration.fit.priors import Prior, board_prior
-from calibration.fit.stereo_model import Observations, StereoModel, moved, predict
+from calibration.fit.priors import Prior
+from calibration.fit.stereo_model import N_STEREO, Observations, StereoModel, moved, predict
 from calibration.kit import least_squares
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
@@ -26,11 +26,10 @@ class Problem:
 
     observations: Observations  # sorted by view
     weights: Array  # (m, 2, 2) inverse covariance [1/px^2]
-    stereo_basis: Array  # (24, s1) free directions of intrinsics and stereo pose
-    shape_basis: Array  # (n, 3, s2) free directions of the target's points
+    shape_basis: Array  # (n, 3, s2) directions of the target's points
     apart: Mask  # (n_views,) views whose two images have independent poses of the board
+    prior: Prior  # of the cameras and of the board's shape
     huber: float = np.inf  # sigmas beyond which residuals count linearly
-    prior: Prior | None = None  # of the cameras
     motion: BoardMotion | None = None  # of the boards between the two exposures, for a model with two poses per view
 
     @property
@@ -43,17 +42,18 @@ class Problem:
         """Number of parameters of one view: of one pose of the board, or of two."""
         return 6 if self.motion is None and not self.apart.any() else 12
 
+    @property
+    def places(self) -> NDArray[np.intp]:
+        """(m,) place of the board at each observation: twice its view, or one more for its second place."""
+        o = self.observations
+        return 2 * o.view + o.camera * self.apart[o.view]
+
     def seeing(self, observations: Observations, extra: float) -> Problem:
         """The same with other observations, and `extra` [px^2] added to their covariances in both axes."""
         return replace(self, observations=observations, weights=inverse_covariance(observations.covariance, extra))
 
-    def with_shape(self, nominal: Array, basis: Array) -> Problem:
-        """The same with points (n, 3) that may move along `basis` (n, 3, s2), with their prior."""
-        prior = self.prior and replace(self.prior, board=board_prior(nominal, basis))
-        return replace(self, shape_basis=basis, prior=prior)
-
     def rows(self, model: StereoModel, beyond: Array | None = None) -> tuple[Array, NDArray[np.intp], Array]:
-        """Whitened rows (r, c) of all data, the view of each (r,), and chi-square, or Huber's loss, of each view.
+        """Whitened rows (r, c) of all data, the view of each (r,), and Huber's loss less chi-square of each view.
 
         Columns: pose of the board, or both if some views have two | stereo | shape | beyond (m, 2, b) | residual.
         NaN for points behind their camera.
@@ -65,49 +65,41 @@ class Problem:
                 place = o.camera * (self.apart[o.view] | (self.motion is not None))
                 d_pose = np.concatenate([np.where((place == c)[:, None, None], d_pose, 0.0) for c in (0, 1)], axis=-1)
             residual = o.pixels - pixels
-            stereo = np.tensordot(d_stereo, self.stereo_basis, 1)
-            columns = [d_pose, stereo, d_point @ self.shape_basis[o.point], residual[..., None]]
+            columns = [d_pose, d_stereo, d_point @ self.shape_basis[o.point], residual[..., None]]
             columns[3:3] = [] if beyond is None else [beyond]
             x, y = np.moveaxis(np.concatenate(columns, axis=-1), 1, 0)
-            sigmas = np.sqrt(quadratic(self.weights, residual))
+            sigmas = np.sqrt(np.einsum("mi,mij,mj->m", residual, self.weights, residual))
             within = np.minimum(sigmas, self.huber)
-            robust = np.minimum(self.huber / np.maximum(sigmas, 1e-300), 1.0)
+            robust = np.fmin(self.huber / np.maximum(sigmas, 1e-300), 1.0)
             root = np.linalg.cholesky(self.weights * robust[:, None, None])[..., None]  # its transpose whitens
             rows = np.concatenate([root[:, 0, 0] * x + root[:, 1, 0] * y, root[:, 1, 1] * y])
             view = np.tile(o.view, 2)
-            costs: Array = np.bincount(o.view, within * (2.0 * sigmas - within), V).astype(float)
+            linear: Array = np.bincount(o.view, within * (sigmas - within), V).astype(float)
         if self.motion is not None:
             between, by_poses = motions(model)
             root = np.sqrt(self.motion.weights_of(V) * ((np.bincount(o.view, minlength=V) > 0) & ~self.apart)[:, None])
             tied = np.zeros((V, 6, rows.shape[1]))
             tied[..., :12], tied[..., -1] = root[..., None] * by_poses, -root * between
             rows, view = np.concatenate([rows, tied.reshape(6 * V, -1)]), np.append(view, np.repeat(np.arange(V), 6))
-            costs += np.sum(tied[..., -1] ** 2, axis=1)
-        return rows, view, costs
+        return rows, view, linear
 
     def linearise(self, model: StereoModel) -> Normal:
         """Normal equations at the model."""
-        rows, view, costs = self.rows(model)
+        rows, view, linear = self.rows(model)
         order, count = np.argsort(view, kind="stable"), np.bincount(view, minlength=self.n_views)
         place, of_view = np.empty(len(view), int), np.zeros((self.n_views, count.max(), rows.shape[1]))
         place[order] = np.arange(len(view)) - np.repeat(np.cumsum(count) - count, count)
         of_view[view, place] = rows
         normal = normal_of_rows(of_view, self.n_own)
-        prior = normal.prior if self.prior is None else self.prior.normal(model, self.stereo_basis)
-        return replace(normal, costs=np.where(np.isfinite(costs), costs, np.inf), prior=prior)
+        costs = normal.costs + linear
+        return replace(normal, costs=np.where(np.isfinite(costs), costs, np.inf), prior=self.prior.normal(model))
 
     def stepped(self, model: StereoModel, shared: Array, poses: Array) -> StereoModel:
         """The model after a step."""
-        s1, steps = self.stereo_basis.shape[1], poses.reshape(self.n_views, -1, 6)
+        steps = poses.reshape(self.n_views, -1, 6)
         if self.motion is None:
             steps = np.where(self.apart[:, None, None], steps, steps[:, :1])
-        return moved(model, self.stereo_basis @ shared[:s1], steps, self.shape_basis @ shared[s1:])
-
-
-def quadratic(matrix: Array, vector: Array) -> Array:
-    """v^T M v (m,) for M (m, 2, 2) and v (m, 2)."""
-    value: Array = np.einsum("mi,mij,mj->m", vector, matrix, vector)
-    return value
+        return moved(model, shared[:N_STEREO], steps, self.shape_basis @ shared[N_STEREO:])
 
 
 def inverse_covariance(covariance: Array, extra: float) -> Array:

@@ -1,14 +1,10 @@
-"""Joint least-squares refinement of both cameras, their relative pose, all board poses and optionally the board.
+"""Joint least-squares refinement of both cameras, their relative pose, all board poses and the board's shape.
 
-Outliers are rejected, and the noise beyond the stated covariances of the points is estimated. The model of the board's
-shape is selected by cross-validation.
-
-The distortion model is not selected in this way. A term that is not significant need not be zero: without it, its error
-would bias all other parameters unnoticed (1.8 to 2.3 times the stated variance with three to eight views). All terms
-are fitted, with `priors` of their usual size.
+Outliers are rejected, and the noise beyond the stated covariances of the points is estimated. No term is left out: one
+that is not significant need not be zero, and without it, its error would bias all other parameters unnoticed (1.8 to
+2.3 times the stated variance with three to eight views). All are fitted, with `priors` of their usual size.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,26 +13,18 @@ import scipy
 from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import triangulate
 from calibration.fit.board_motion import BoardMotion, updated
-from calibration.fit.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
-from calibration.fit.priors import priors_of
-from calibration.fit.stereo_model import (
-    Observations,
-    StereoModel,
-    Terms,
-    board_basis,
-    predict_pixels,
-    restricted,
-)
+from calibration.fit.normal_equations import Normal, Problem, inverse_covariance, minimise
+from calibration.fit.priors import VARIANCES, board_basis, priors_of
+from calibration.fit.stereo_model import N_STEREO, Observations, StereoModel, predict_pixels
+from calibration.kit import least_squares
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
 
 FREE_ROUNDS = 6  # of rejection in which points may be accepted again; not in as many more, so that the rounds end
-MOST_DISAGREEMENT = 100.0  # bound of the disagreement of views, which few views determine poorly
 FOLDS = 5
+OVERSTATED = 1e-2  # smallest variance of the residuals over that stated
 NEGLIGIBLE = 1e-5  # relative decrease of chi-square: for 10^4 points, a third of a sigma of one parameter
-TRUNCATE = 30.0  # squared sigmas: one bad corner must not decide between two models
-SIMPLER_WITHIN = 0.25  # standard errors of the paired difference by which a simpler model may be worse
 
 
 @dataclass(frozen=True)
@@ -44,7 +32,6 @@ class Refinement:
     """Result of `refine_stereo`."""
 
     model: StereoModel
-    terms: Terms
     observations: Observations  # including the rejected ones
     kept: Mask  # (m,)
     residuals: Array  # (m, 2) observed - predicted [px], including the rejected ones
@@ -61,7 +48,7 @@ class Refinement:
 
         1 for a correct model, larger if errors are common to the corners of a view.
         """
-        return self.normal.disagreement(self.problem.stereo_basis.shape[1])
+        return self.normal.disagreement(N_STEREO)
 
     def rms(self, select: Mask | None = None) -> float:
         """Root mean square distance [px] of observed from predicted points, of those kept or also selected."""
@@ -69,56 +56,43 @@ class Refinement:
         return float(np.sqrt(np.mean(np.sum(self.residuals[use] ** 2, axis=-1)))) if use.any() else float("nan")
 
 
-def _degrees_of_freedom(problem: Problem) -> int:
-    used = problem.observations
-    seen = len(np.unique(2 * used.view + used.camera * problem.apart[used.view]))
-    left = 2 * len(used) - problem.stereo_basis.shape[1] - problem.shape_basis.shape[-1] - 6 * seen
-    if left <= 0:
-        raise CalibrationError(
-            f"{len(used)} points in {seen} views are fewer than the parameters to be found: take more views, or fewer "
-            "free terms"
-        )
-    return left
-
-
 @checked
 def refine_stereo(
     observations: Observations,
     start: StereoModel,
     nominal: Array,
-    terms: Terms | None = None,
     reject_beyond: float = 5.5,
-    begin: Refinement | None = None,
-    priors: bool = True,
     motion: BoardMotion | None = None,
 ) -> Refinement:
-    """Refine all free parameters of `terms` from image points of a flat target.
+    """Refine cameras, their relative pose, poses and shape of a flat target from its image points.
 
     observations : image points with covariances, of any target with known points: corners of squares or dots
     start : cameras, stereo pose and board poses to a few percent and degrees, see `calibration.fit.start`; a view with
         two poses of the board keeps two
     nominal : (n, 3) [m] the declared points of the target
     reject_beyond : sigmas, with the noise estimated from the residuals; of 10^4 good points none exceeds the default
-    begin : an earlier refinement of the same observations with other terms, which replaces the robust start
-    priors : whether the priors of cameras and boards are used, see `priors`
-    motion : approximate motion of boards between the two exposures of a pair; None: none, or that of `begin`
+    motion : approximate motion of boards between the two exposures of a pair; None: none
 
     Raises CalibrationError if the views cannot determine the parameters.
     """
-    terms, observations = terms or Terms(), observations[np.argsort(observations.view, kind="stable")]
-    shape_basis = board_basis(nominal, terms.board)
-    model = restricted(start if begin is None else begin.model, nominal, terms)
-    motion = begin.problem.motion if motion is None and begin is not None else motion
-    prior = priors_of(model, nominal, shape_basis) if priors else None
-    weights, bases = inverse_covariance(observations.covariance, 0.0), (terms.stereo_basis(), shape_basis)
-    problem = Problem(observations, weights, *bases, start.apart if begin is None else begin.problem.apart, prior=prior)
-    if begin is None:
-        kept = np.ones(len(observations), bool)
-        model, extra = _robust_start(problem, model)
-    else:
-        kept, extra = begin.kept, begin.unexplained_sigma**2
-    rough = replace(problem, motion=motion)
-    problem, model, kept, extra, dof, total = _settled(rough, model, kept, extra, reject_beyond)
+    observations = observations[np.argsort(observations.view, kind="stable")]
+    basis, weights = board_basis(nominal), inverse_covariance(observations.covariance, 0.0)
+    model = replace(start, points=nominal)
+    problem = Problem(observations, weights, basis, start.apart, priors_of(model, nominal, basis))
+    exact = replace(problem.prior, known=problem.prior.known / VARIANCES[0])
+    for _ in range(2):  # robust, as whole images may be wrong, and with the declared board
+        rough = problem.seeing(observations, _median_variance(model, observations))
+        rough = replace(rough, prior=exact, huber=2.0)
+        model = minimise(rough, model, iterations=30, tolerance=1e-5, rough=True).model
+    extra = _median_variance(model, observations)
+    kept = _accepted(problem, model, extra, reject_beyond)
+    return refined(replace(problem, motion=motion), model, kept, extra, reject_beyond)
+
+
+def refined(problem: Problem, model: StereoModel, kept: Mask, extra: float, reject_beyond: float = 5.5) -> Refinement:
+    """The refinement from a model near the minimum, see `_settled`."""
+    observations = problem.observations
+    problem, model, kept, extra, dof, total = _settled(problem, model, kept, extra, reject_beyond)
     used = observations[kept]
     # with noise and points fixed, the exact minimum; then again with the noise estimated there, so that the result does
     # not depend on where the rough rounds stopped
@@ -131,7 +105,6 @@ def refine_stereo(
     own = _mahalanobis2(residuals[kept], observations.covariance[kept], 0.0)
     return Refinement(
         model=model,
-        terms=terms,
         observations=observations,
         kept=kept,
         residuals=residuals,
@@ -147,33 +120,36 @@ def refine_stereo(
 def _settled(
     problem: Problem, model: StereoModel, kept: Mask, extra: float, reject_beyond: float
 ) -> tuple[Problem, StereoModel, Mask, float, float, int]:
-    """Rounds of rough fits until noise, accepted points, motion of the boards and weight of the prior are consistent.
+    """Rounds of rough fits until noise, accepted points, motion of the boards and the prior are consistent.
 
     problem : of all observations, of which those `kept` are fitted first; extra : [px^2] in addition to their noise
     returns : problem and model, points that were fitted, extra variance, degrees of freedom, number of steps
     """
-    observations, total = problem.observations, 0
-    place = 2 * observations.view + observations.camera * problem.apart[observations.view]  # of the board
+    whole, observations, total, found = problem, problem.observations, 0, np.inf
+    place = problem.places
     for turn in range(2 * FREE_ROUNDS):
         used, motion, prior = observations[kept], problem.motion, problem.prior
         problem = problem.seeing(used, extra)
-        dof: float = _degrees_of_freedom(problem)
+        seen = len(np.unique(place[kept]))
         minimum = minimise(problem, model, tolerance=1e-5, damping=1e-6, rough=True)
         model, total = minimum.model, total + minimum.iterations
-        steady = True
+        # the stated noise may be too large: the prior is weighted by that of the residuals
+        noise = float(minimum.normal.costs.sum()) / max(2 * len(used) - N_STEREO - 6 * seen, 1)
+        weight = max(float(np.nan_to_num(minimum.normal.disagreement(N_STEREO))), min(noise, 1.0), OVERSTATED)
+        learnt, determined = prior.learnt(minimum.normal, model, weight)
+        steady, dof = abs(determined - found) < 0.01, 2 * len(used) - N_STEREO - 6 * seen - determined
+        problem, found = replace(problem, prior=learnt), determined
         if motion is not None:
             moves, determined = updated(motion, model, minimum.normal.covariances()[1], problem.apart)
-            dof, steady = dof - determined, moves.is_near(motion)
+            dof, steady = dof - determined, steady and moves.is_near(motion)
             problem = replace(problem, motion=moves)
-        if prior is not None:
-            disagreement = float(np.nan_to_num(minimum.normal.disagreement(problem.stereo_basis.shape[1])))
-            weight = min(max(disagreement, 1.0 / MOST_DISAGREEMENT), MOST_DISAGREEMENT)
-            problem = replace(problem, prior=replace(prior, weight=weight))
         residuals = observations.pixels - predict_pixels(model, observations)
+        if dof <= 0:
+            raise CalibrationError(
+                f"{len(used)} points in {seen} views are fewer than the parameters to be found: take more views"
+            )
         before, extra = extra, _extra_variance(residuals[kept], used.covariance, dof)
-        good = _mahalanobis2(residuals, observations.covariance, extra) < reject_beyond**2
-        good = good & kept if turn >= FREE_ROUNDS else good
-        good &= np.bincount(place, good)[place] >= min(LEAST_POINTS, len(model.points))  # fewer determine no pose
+        good = _accepted(whole, model, extra, reject_beyond, kept if turn >= FREE_ROUNDS else True)
         if steady and abs(extra - before) <= 0.01 * before + 1e-10 and bool((good == kept).all()):
             break
         if turn < 2 * FREE_ROUNDS - 1:  # the returned values are those of the fitted points
@@ -181,23 +157,23 @@ def _settled(
     return problem, model, kept, extra, dof, total
 
 
-def _robust_start(problem: Problem, model: StereoModel) -> tuple[StereoModel, float]:
-    """Huber fit with the noise estimated from the median residual, and the extra variance [px^2]."""
-    observations = problem.observations
-    for _ in range(2):
-        extra = _median_variance(observations.pixels - predict_pixels(model, observations))
-        rough = replace(problem.seeing(observations, extra), huber=2.0)
-        model = minimise(rough, model, iterations=30, tolerance=1e-5, rough=True).model
-    return model, _median_variance(observations.pixels - predict_pixels(model, observations))
-
-
-def _median_variance(residuals: Array) -> float:
+def _median_variance(model: StereoModel, observations: Observations) -> float:
     """Variance per axis from the median of squared 2-D residuals, 2 ln 2 sigma^2 for a Gaussian."""
+    residuals = observations.pixels - predict_pixels(model, observations)
     return float(np.median(np.sum(residuals**2, axis=-1)) / (2 * np.log(2))) + 1e-12
 
 
+def _accepted(problem: Problem, model: StereoModel, extra: float, beyond: float, among: Mask | bool = True) -> Mask:
+    """Points (m,) whose residuals are below a number of sigmas, and enough of which are in their image."""
+    o, place = problem.observations, problem.places
+    good = (_mahalanobis2(o.pixels - predict_pixels(model, o), o.covariance, extra) < beyond**2) & among
+    found: Mask = good & (np.bincount(place, good)[place] >= min(LEAST_POINTS, len(model.points)))
+    return found
+
+
 def _mahalanobis2(residuals: Array, covariance: Array, extra: float) -> Array:
-    return quadratic(inverse_covariance(covariance, extra), residuals)
+    weights = inverse_covariance(covariance, extra)
+    return np.asarray(np.einsum("mi,mij,mj->m", residuals, weights, residuals), np.float64)
 
 
 def _extra_variance(residuals: Array, covariance: Array, dof: float) -> float:
@@ -212,20 +188,6 @@ def _extra_variance(residuals: Array, covariance: Array, dof: float) -> float:
         return 0.0
     most = 2.0 * float(np.sum(residuals**2)) / dof + 1e-12
     return float(scipy.optimize.brentq(excess, 0.0, most, xtol=1e-12 * most))
-
-
-@dataclass(frozen=True)
-class TermsTried:
-    """One row of the cross-validation table."""
-
-    terms: Terms
-    n_parameters: int  # shared by all views
-    rms_px: float  # of the fitted views
-    held_out_rms_px: float  # of held-out views, with their poses fitted
-    held_out_error: float  # [m] the same for corners in space, rms over those views; NaN if no view has both cameras
-    held_out_chi_square: float  # per observation, truncated, in units of the noise of this comparison
-    noise_px: float  # sigma per axis beyond the corners' noise, for all models: the least of them
-    per_view: Array  # (n_views,) held-out chi-square of each view, NaN if it was not used
 
 
 def error_in_space(model: StereoModel, seen: Observations) -> float:
@@ -244,68 +206,34 @@ def error_in_space(model: StereoModel, seen: Observations) -> float:
 
 def fit_poses(problem: Problem, model: StereoModel) -> StereoModel:
     """The model with the poses of the target fitted to the problem's observations, everything else fixed."""
-    nothing = problem.stereo_basis[:, :0], problem.shape_basis[..., :0]
-    poses = replace(problem, stereo_basis=nothing[0], shape_basis=nothing[1], prior=None, huber=3.0)
-    return minimise(poses, model, iterations=12, tolerance=NEGLIGIBLE, damping=1e-7, rough=True).model
+    poses = replace(problem, shape_basis=problem.shape_basis[..., :0])
+    own = np.append(np.arange(poses.n_own), -1)
+
+    def linearise(model: StereoModel) -> Normal:
+        normal = poses.linearise(model)
+        return replace(normal, products=normal.products[:, own[:, None], own], prior=np.zeros((1, 1)))
+
+    def stepped(model: StereoModel, _: Array, steps: Array) -> StereoModel:
+        return poses.stepped(model, np.zeros(N_STEREO), steps)
+
+    return least_squares.minimise(linearise, stepped, model, 12, NEGLIGIBLE, damping=1e-7, rough=True).model
 
 
-def candidate(refinement: Refinement, quietest: Refinement) -> TermsTried:
-    """Cross-validation of one fitted model; in held-out views the pose is fitted.
+def held_out(refinement: Refinement) -> tuple[float, float]:
+    """Rms distance of points in held-out views [px], and of corners in space from the board fitted to them [m].
 
-    Noise, points for distances and motion of the boards are those of `quietest`, the same for all candidates.
+    The poses of held-out views are fitted. The second is NaN if no view has both cameras.
     """
-    o, problem = refinement.observations, replace(refinement.problem, motion=quietest.problem.motion)
-    used, sigma, views = o[refinement.kept], quietest.unexplained_sigma, np.unique(problem.observations.view)
-    residuals, tested, errors = np.zeros_like(o.pixels), np.isin(o.view, views), []
-    for fold in range(min(FOLDS, len(views))):
-        left_out = views[fold :: min(FOLDS, len(views))]
-        train, test = ~np.isin(used.view, left_out), np.isin(o.view, left_out)
-        others = problem.seeing(used[train], sigma**2)
+    problem, extra, errors = refinement.problem, refinement.unexplained_sigma**2, []
+    used, views = problem.observations, np.unique(problem.observations.view)
+    residuals = np.empty_like(used.pixels)
+    for left_out in (views[fold::FOLDS] for fold in range(min(FOLDS, len(views)))):
+        test = np.isin(used.view, left_out)
+        others, theirs = (problem.seeing(used[which], extra) for which in (~test, test))
         model = minimise(others, refinement.model, iterations=8, tolerance=NEGLIGIBLE, damping=1e-7, rough=True).model
-        model = fit_poses(problem.seeing(o[test], sigma**2), model)
-        residuals[test] = o.pixels[test] - predict_pixels(model, o[test])
-        pairs = left_out[~problem.apart[left_out]]
-        errors += [error_in_space(model, o[quietest.kept & (o.view == v)]) for v in pairs]
-    chi_square = np.minimum(quadratic(inverse_covariance(o.covariance, sigma**2), residuals), TRUNCATE)
-    chi_square = np.where(np.isfinite(chi_square), chi_square, TRUNCATE)  # behind a camera
-    sums, count = (np.bincount(o.view[tested], of, problem.n_views) for of in (chi_square[tested], None))
-    good, error = tested & quietest.kept, np.array(errors)[np.isfinite(errors)]
-    return TermsTried(
-        terms=refinement.terms,
-        n_parameters=problem.stereo_basis.shape[1] + problem.shape_basis.shape[-1],
-        rms_px=refinement.rms(),
-        held_out_rms_px=float(np.sqrt(np.nansum(residuals[good] ** 2) / max(good.sum(), 1))),
-        held_out_error=float(np.sqrt(np.mean(error**2))) if len(error) else np.nan,
-        held_out_chi_square=float(sums.sum() / max(count.sum(), 1)),
-        noise_px=sigma,
-        per_view=sums / np.where(count > 0, count, np.nan),
-    )
-
-
-def is_near(row: TermsTried, best: TermsTried) -> bool:
-    """Whether a model's held-out chi-square is not significantly worse than the best."""
-    difference = row.per_view - best.per_view
-    difference = difference[np.isfinite(difference)]
-    error = float(np.std(difference) / np.sqrt(max(len(difference) - 1, 1)))
-    return bool(np.mean(difference) <= SIMPLER_WITHIN * error)
-
-
-def choose_board(
-    observations: Observations,
-    start: StereoModel,
-    nominal: Array,
-    tried: Sequence[Terms],
-    motion: BoardMotion | None = None,
-) -> tuple[Refinement, tuple[TermsTried, ...]]:
-    """Select the model of the board's shape among the terms `tried`, simplest first; a single one is used unchanged.
-
-    Returns the refinement with the selected terms and the table of candidates. motion : as in `refine_stereo`
-    """
-    fits: list[Refinement] = []
-    for terms in tried:
-        begin = fits[0] if fits else None
-        fits.append(refine_stereo(observations, start, nominal, terms, begin=begin, motion=None if begin else motion))
-    quietest = min(fits, key=lambda fit: fit.unexplained_sigma)
-    table = [candidate(fit, quietest) for fit in fits]
-    best = min(table, key=lambda row: row.held_out_chi_square)
-    return next(fit for fit, row in zip(fits, table, strict=True) if is_near(row, best)), tuple(table)
+        model = fit_poses(theirs, model)
+        residuals[test] = used.pixels[test] - predict_pixels(model, used[test])
+        errors += [error_in_space(model, used[used.view == v]) for v in left_out[~problem.apart[left_out]]]
+    error = np.array(errors)[np.isfinite(errors)]
+    rms = float(np.sqrt(np.nansum(residuals**2) / len(used)))
+    return rms, float(np.sqrt(np.mean(error**2))) if len(error) else np.nan

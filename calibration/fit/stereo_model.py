@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.cameras.camera import (
-    INTRINSIC_PARAMETERS,
-    N_INTRINSIC,
     N_RIG,
     PAIR_SHIFT,
     StereoRig,
@@ -18,11 +16,8 @@ from calibration.cameras.camera import (
 )
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
-from calibration.kit.errors import ArgumentError, CalibrationError
+from calibration.kit.errors import ArgumentError
 
-RICHEST = "k1 k2 p1 p2 k3"
-DISTORTION_MODELS = ("none", "k1", "k1 k2", "k1 k2 p1 p2", "k1 k2 k3", RICHEST)  # by the terms that are free
-BOARD_MODELS = ("flat", "warped", "free")
 N_STEREO = PAIR_SHIFT.stop  # left and right intrinsics, rotation and translation of the pair come first
 
 
@@ -67,63 +62,6 @@ class StereoModel:
         return np.asarray(np.ptp(self.t_left_board, axis=1).any(axis=1), bool)
 
 
-@dataclass(frozen=True)
-class Terms:
-    """Free parameters of the refinement."""
-
-    distortion: str = RICHEST  # one of DISTORTION_MODELS, the same for both cameras
-    board: str = "flat"  # one of BOARD_MODELS
-
-    def __post_init__(self) -> None:
-        if self.distortion not in DISTORTION_MODELS:
-            raise CalibrationError(
-                f"distortion {self.distortion!r} is unknown; choose of {', '.join(DISTORTION_MODELS)}"
-            )
-        if self.board not in BOARD_MODELS:
-            raise CalibrationError(f"board model {self.board!r} is unknown; choose of {', '.join(BOARD_MODELS)}")
-
-    @property
-    def free(self) -> Mask:
-        """(24,) which of intrinsics and stereo pose are free."""
-        free = {*INTRINSIC_PARAMETERS[:4], *self.distortion.split()}
-        own = np.array([name in free for name in INTRINSIC_PARAMETERS])
-        return np.concatenate([own, own, np.ones(6, bool)])
-
-    def stereo_basis(self) -> Array:
-        """(24, n_free) columns span the free directions of intrinsics and stereo pose."""
-        return np.eye(N_STEREO)[:, self.free]
-
-
-def board_basis(nominal: Array, board: str) -> Array:
-    """(n, 3, n_shape): displacement of the target's points [m] per unit of each shape parameter [m].
-
-    flat: none. warped: out of the plane as x^2, x y, y^2 over the half size; in the plane stretch of one side against
-    the other, and shear, as of a print stretched by the paper feed. free: every coordinate of every point.
-    Shift, rotation and scale of the whole target are excluded: they are equivalent to another pose and baseline. So the
-    mean plane is the declared one, and errors of the two sides are equal and opposite, the most likely size if both
-    were made equally well.
-    """
-    n = len(nominal)
-    if board == "flat":
-        return np.zeros((n, 3, 0))
-    d = nominal - nominal.mean(0)
-    size = np.abs(d).max()
-    rows = [np.broadcast_to(axis * size, d.shape) for axis in np.eye(3)]
-    spread = np.sum(d**2, axis=0)[:2]
-    rows += [np.cross(axis, d) for axis in np.eye(3)] + [d * [*spread[::-1] / spread.sum(), 0.0]]
-    gauge = np.stack([row.reshape(-1) for row in rows], axis=-1)
-    q, _ = np.linalg.qr(gauge, mode="complete")
-    if board == "free":
-        return q[:, 7:].reshape(n, 3, 3 * n - 7)
-    x, y = (d / np.abs(d).max(0).clip(1e-12))[:, :2].T
-    warp = np.zeros((n, 3, 5))
-    warp[:, 2, :3] = np.stack([x * x, x * y, y * y], axis=-1)
-    warp[:, :2, 3] = d[:, :2] * [0.5, -0.5] / size
-    warp[:, :2, 4] = d[:, 1::-1] * 0.5 / size
-    flat = warp.reshape(3 * n, -1)
-    return (flat - q[:, :7] @ (q[:, :7].T @ flat)).reshape(warp.shape)
-
-
 def predict_pixels(model: StereoModel, observations: Observations) -> Array:
     """Pixels (m, 2) without derivatives."""
     return predict(model, observations)[0]
@@ -150,14 +88,3 @@ def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) 
         t_left_board=model.t_left_board + poses[..., 3:],
         points=model.points + displacement,
     )
-
-
-def restricted(model: StereoModel, nominal: Array, terms: Terms) -> StereoModel:
-    """The model with terms that are not free set to zero: distortion, deformation of the board, fx - fy."""
-    basis = board_basis(nominal, terms.board).reshape(nominal.size, -1)
-    shape = np.linalg.pinv(basis) @ (model.points - nominal).reshape(-1)
-    held = np.zeros(N_RIG)
-    held[: 2 * N_INTRINSIC] = np.concatenate([camera.parameters for camera in model.rig.cameras])
-    held[:N_STEREO][terms.free] = 0.0
-    points = nominal + (basis @ shape).reshape(nominal.shape)
-    return replace(model, points=points, rig=model.rig.perturbed(-held))

@@ -7,7 +7,8 @@ import numpy as np
 
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig, causes
 from calibration.fit.pairing import GOOD_VIEWS
-from calibration.fit.refinement import Refinement, TermsTried
+from calibration.fit.refinement import Refinement, held_out
+from calibration.fit.stereo_model import N_STEREO
 from calibration.judge.pairs import PairMotion
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import solve_each
@@ -61,7 +62,7 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
     smaller than that of the corners' noise.
     """
     problem = refinement.problem
-    s1, views = problem.stereo_basis.shape[1], len(np.unique(problem.observations.view))
+    s1, views = N_STEREO, len(np.unique(problem.observations.view))
     shift, spread, inverse, scale = refinement.normal.shifts(s1, common)
     expected = inverse.T @ spread @ inverse
     values, vectors = np.linalg.eigh(expected)
@@ -79,10 +80,9 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
     share = s1 / max(
         float(np.trace(np.linalg.solve(at_minimum, expected))), 1e-12
     )  # noise moves fewer than s1 directions
-    by_prior = np.zeros((s1, s1))
-    if problem.prior is not None:  # its weight was multiplied by the disagreement of the views
-        extra = max(problem.prior.weight - 1.0, 0.0) * refinement.normal.prior[:-1, :-1] * scale[:, None] * scale
-        by_prior = inverse.T @ extra @ inverse
+    # its weight was multiplied by the disagreement of the views
+    extra = (problem.prior.weight - 1.0) * refinement.normal.prior[:-1, :-1] * scale[:, None] * scale
+    by_prior = inverse.T @ extra @ inverse
     result: Array = (at_minimum + share * beyond @ beyond.T + by_prior) * scale[:s1, None] * scale[:s1]
     return result
 
@@ -146,7 +146,6 @@ def length_uncertainty(rig: StereoRig, points_world: Array) -> tuple[float, floa
 
 def assess(
     refinement: Refinement,
-    chosen: TermsTried,
     rig: StereoRig,
     rig_with_board: StereoRig,
     table_view: int | None,
@@ -156,8 +155,8 @@ def assess(
 ) -> Assessment:
     """Compute the figures and the verdict.
 
-    chosen : the row of the selected terms; rig : with the covariance due to the views alone; rig_with_board : including
-    the tolerances of the board; wide : result of `start.too_wide`
+    rig : with the covariance due to the views alone; rig_with_board : including the tolerances of the board
+    wide : result of `start.too_wide`
     """
     kept = refinement.observations[refinement.kept]
     both = np.intersect1d(kept.view[kept.camera == 0], kept.view[kept.camera == 1])
@@ -165,9 +164,10 @@ def assess(
     sigma = np.linalg.norm(point_uncertainty(rig, volume), axis=-1)
     along, across = length_uncertainty(rig, volume)
     place, most = causes(rig_with_board, _shifts_of_points(rig_with_board, volume))
+    misfit, held_out_error = held_out(refinement)
     found = Assessment(
-        stereo_misfit_px=chosen.held_out_rms_px,
-        held_out_error=chosen.held_out_error,
+        stereo_misfit_px=misfit,
+        held_out_error=held_out_error,
         triangulation_sigma=(float(np.sqrt(np.mean(sigma**2))), float(sigma.max())),
         length_sigma=(along, length_uncertainty(rig_with_board, volume)[0]),
         direction_sigma=across,
@@ -179,12 +179,12 @@ def assess(
         coverage=tuple(float(np.mean(cells_of(refinement, camera) > 0)) for camera in range(len(CAMERA_NAMES))),
         tilt_spread_deg=tilt_spread(refinement),
     )
-    grade, verdict, warnings = _judgement(found, refinement, chosen, wide)
+    grade, verdict, warnings = _judgement(found, refinement, wide)
     return replace(found, grade=grade, verdict=verdict, figures=_figures(found, refinement.rms()), warnings=warnings)
 
 
 def _judgement(
-    found: Assessment, refinement: Refinement, chosen: TermsTried, wide: Sequence[tuple[str, str]]
+    found: Assessment, refinement: Refinement, wide: Sequence[tuple[str, str]]
 ) -> tuple[str, str, tuple[str, ...]]:
     """The worst grade of all figures, its reason, and warnings about figures that need action."""
     warnings, reasons = [": ".join(what) for what in wide], [(3, what) for what, _ in wide]
@@ -223,11 +223,11 @@ def _judgement(
             "uncertainties were enlarged by that: the board moved or bent between views, or the lenses are not as "
             "modelled"
         )
-    if chosen.held_out_rms_px > TWICE * chosen.rms_px:
+    if found.stereo_misfit_px > TWICE * refinement.rms():
         reasons.append((2, "views left out of the fit are met far worse than those fitted"))
         warnings.append(
-            f"views that were left out fit at {chosen.held_out_rms_px:.3f} px, those fitted at {chosen.rms_px:.3f} px: "
-            "more and more varied views are needed"
+            f"views that were left out fit at {found.stereo_misfit_px:.3f} px, those fitted at {refinement.rms():.3f} "
+            "px: more and more varied views are needed"
         )
     if not refinement.converged:
         warnings.append("the refinement did not converge: the result is not the least-squares minimum")

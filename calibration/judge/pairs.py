@@ -24,7 +24,7 @@ from calibration.fit.board_motion import LEAST, BoardMotion, motions
 from calibration.fit.pairing import MIN_VIEWS, TOO_FAR, Names, Pairs, apart, poses_of, relative_poses, rotation_vectors
 from calibration.fit.refinement import Refinement, fit_poses
 from calibration.fit.start import start_camera
-from calibration.fit.stereo_model import Observations, predict, predict_pixels
+from calibration.fit.stereo_model import N_STEREO, Observations, predict, predict_pixels
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import scaled_solve
 
@@ -97,7 +97,7 @@ def motion_between_exposures(refinement: Refinement) -> tuple[PairMotion, Array]
     back = np.linalg.inv(J[:, :, 6:])
     # m^T square_px m is the mean square displacement [px^2] in the right image by a motion m
     square_px = np.swapaxes(back, 1, 2) @ (squares[pairs] / seen[1][pairs, None, None]) @ back
-    taken = np.r_[: problem.stereo_basis.shape[1], s]  # with fixed board shape, whose uncertainty is small
+    taken = np.r_[:N_STEREO, s]  # with fixed board shape, whose uncertainty is small
     distance = float(np.median(np.linalg.norm(model.t_left_board[pairs, 0], axis=1)))
     size = _likely_size(rows[..., taken], noise * C, square[np.ix_(taken, taken)] / noise, distance)
     gradients, known = np.zeros((n_views, s, s)), np.linalg.solve(C, W)

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, WORLD_SHIFT, WORLD_TURN, Allowance, StereoRig
+from calibration.fit.priors import PARTS, STRETCH
 from calibration.fit.refinement import Refinement
-from calibration.fit.stereo_model import N_STEREO, board_basis
+from calibration.fit.stereo_model import N_STEREO
 from calibration.kit.arrays import Array
-from calibration.kit.least_squares import scaled_solve
 
 ASSUMED_THICKNESS = 20e-6  # [m] standard deviation of a calliper
 SIZE, FLATNESS, THICKNESS = "the board's size", "the board's flatness", "the board's thickness"
@@ -34,66 +34,41 @@ class BoardTolerances:
 
 @dataclass(frozen=True)
 class BoardShape:
-    """Deviation of the board from the declared one, as determined by its views."""
+    """Deviation of the board from the declared one: as refined, and as its views alone determine it."""
 
-    stretch: float  # relative difference of lengths along i and along j
+    refined_stretch: float  # relative difference of lengths along i and along j
+    stretch: float
     stretch_sigma: float
-    lift: float  # [m] height of the mean plane of the printed face above its lowest part, which touches a table
+    refined_lift: float  # [m] height of the mean plane of the printed face above its lowest part, which touches a table
+    lift: float
     lift_sigma: float
-    misprint: float  # [m] rms per coordinate of the corners in their plane, beyond stretch and shear; 0 if not refined
-    refined: bool  # True if the calibration's board has this shape; else the board was assumed to be flat
+    misprint: float  # [m] rms per coordinate of the corners in their plane, beyond stretch and shear
 
 
 def board_shape(refinement: Refinement, nominal: Array, inflation: float) -> BoardShape:
-    """The smooth part of the board's shape with its sigma, for any refined model of the board.
+    """The board's shape, and its smooth part by one step with a prior of the largest size, with its sigma.
 
     nominal : (n, 3) [m] the declared points of the target, on a grid
     inflation : factor on the covariance that follows from the points' noise
     """
-    n, warp = len(nominal), board_basis(nominal, "warped")
-    free, s1 = refinement.terms.board == "free", refinement.problem.stereo_basis.shape[1]
-    basis, to_smooth = board_basis(nominal, "free") if free else warp, np.linalg.pinv(warp.reshape(3 * n, -1))
-    normal = refinement.problem.with_shape(nominal, basis).linearise(refinement.model)  # with a step from a flat board
-    departure = (refinement.model.points - nominal + basis @ normal.step()[0][s1:]).reshape(-1)
-    found, onto = to_smooth @ departure, to_smooth @ basis.reshape(3 * n, -1)
-    C = onto @ normal.covariances()[0][s1:, s1:] @ onto.T
-    C = inflation * C
-    left = (departure.reshape(n, 3) - warp @ found)[:, :2]
-    size = float(np.abs(nominal - nominal.mean(0)).max())
-    heights = _over_the_board(nominal, warp[:, 2, :3])
+    problem, (bends, _, others) = refinement.problem, PARTS
+    prior, basis, smooth = problem.prior, problem.shape_basis, np.arange(others.start)
+    known, towards = prior.known.copy(), prior.towards.copy()
+    known[np.ix_(smooth, smooth)], towards[smooth] = np.eye(len(smooth)), 0.0
+    normal = replace(problem, prior=replace(prior, known=known, towards=towards)).linearise(refinement.model)
+    refined = prior.shape(refinement.model)
+    found = refined + normal.step()[0][N_STEREO:]
+    C = inflation * normal.covariances()[0][N_STEREO:, N_STEREO:]
+    heights = _over_the_board(nominal, basis[:, 2, bends])
     return BoardShape(
-        stretch=float(found[3]) / size,
-        stretch_sigma=float(np.sqrt(C[3, 3])) / size,
-        lift=-float((heights @ found[:3]).min()),
-        lift_sigma=float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", heights, C[:3, :3], heights)))),
-        misprint=float(np.sqrt(np.mean(left**2))) if free else 0.0,
-        refined=refinement.terms.board != "flat",
+        refined_stretch=STRETCH * float(refined[3]),
+        stretch=STRETCH * float(found[3]),
+        stretch_sigma=STRETCH * float(np.sqrt(C[3, 3])),
+        refined_lift=-float((heights @ refined[bends]).min()),
+        lift=-float((heights @ found[bends]).min()),
+        lift_sigma=float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", heights, C[bends, bends], heights)))),
+        misprint=float(np.sqrt(np.mean((basis[:, :2, others] @ refined[others]) ** 2))),
     )
-
-
-def shape_left_out(
-    refinement: Refinement, nominal: Array, boards: tuple[str, ...], inflation: float
-) -> tuple[Array, float]:
-    """Effect of a more general shape of the board than the refined one: covariance (s1, s1) of the stereo parameters.
-
-    From one step of a refinement with each further shape of `boards`, simplest first, which is minus the bias due to
-    the simpler shape. The step expected from noise is subtracted (in chi-square). The second item is the largest of
-    these shifts, in sigmas of the parameters.
-    """
-    problem, s1 = refinement.problem, refinement.problem.stereo_basis.shape[1]
-    sigma = np.sqrt(inflation * np.diag(refinement.normal.covariances()[0])[:s1])
-    left_out, largest = np.zeros((s1, s1)), 0.0
-    shift, chi_square, n = np.zeros(s1), 0.0, problem.shape_basis.shape[-1]
-    for board in boards[boards.index(refinement.terms.board) + 1 :]:
-        basis = board_basis(nominal, board)
-        normal = problem.with_shape(nominal, basis).linearise(refinement.model)
-        step, C = normal.step()[0], inflation * normal.covariances()[0][s1:, s1:]
-        gain = float(step[s1:] @ scaled_solve(C, step[s1:])) - chi_square
-        further = max(0.0, 1.0 - (basis.shape[-1] - n) / max(gain, 1e-300)) ** 0.5 * (step[:s1] - shift)
-        left_out += np.outer(further, further)
-        largest = max(largest, float(np.max(np.abs(further) / sigma)))
-        shift, chi_square, n = step[:s1], chi_square + gain, basis.shape[-1]
-    return left_out, largest
 
 
 def _over_the_board(nominal: Array, heights: Array) -> Array:
@@ -115,11 +90,8 @@ def on_the_table(nominal: Array, shape: BoardShape) -> Array:
 
     It is below corner 0, which a stretch moves, at the height of the lowest parts of the printed face.
     """
-    if not shape.refined:
-        return np.zeros(3)
-    middle = nominal.mean(0)
-    x, y = -0.5 * shape.stretch, 0.5 * shape.stretch  # of the middle relative to corner 0
-    return np.array([x * middle[0], y * middle[1], -shape.lift])
+    x, y, _ = 0.5 * shape.refined_stretch * nominal.mean(0)  # of the middle relative to corner 0
+    return np.array([-x, y, -shape.refined_lift])
 
 
 def with_tolerances(
@@ -144,11 +116,10 @@ def with_tolerances(
     size = one_side / np.sqrt(2.0)
     if tolerances.square is None:
         size = float(np.hypot(size, shape.misprint / np.sqrt(np.sum(d**2))))
-    of_stretch = shape.stretch_sigma if shape.refined else seen
-    stretch = min(of_stretch, np.sqrt(2.0) * one_side)
+    stretch = min(np.hypot(shape.stretch - shape.refined_stretch, shape.stretch_sigma), np.sqrt(2.0) * one_side)
     flatness = tolerances.flatness
     if flatness is None:  # a bent print may lie on a flat plate
-        flatness = float(np.hypot(shape.lift * (0.5 if shape.refined else 1.0), shape.lift_sigma))
+        flatness = float(np.hypot(shape.lift - 0.5 * shape.refined_lift, shape.lift_sigma))
     thickness = ASSUMED_THICKNESS if tolerances.thickness is None else tolerances.thickness
 
     found: list[Allowance] = []
@@ -197,11 +168,11 @@ def rig_with_covariance(
     origin : (3,) [m] point one thickness above the world's origin, in board axes; by default corner 0
     stereo : better estimate of the covariance of the free stereo parameters, see `assessment.stereo_covariance`
     """
-    model, basis = refinement.model, refinement.problem.stereo_basis
-    n_free, rig = basis.shape[1], model.rig
+    model, rig = refinement.model, refinement.model.rig
     shared, poses, cross = refinement.normal.covariances()
     view, M = table_view or 0, np.zeros((6, 6))  # d world / d pose of the board; zero without a table
-    free, shifted = shared[:n_free, :n_free], cross[view, :n_free, :6]  # of the pose at the left camera's exposure
+    free = shared[:N_STEREO, :N_STEREO]
+    shifted = cross[view, :N_STEREO, :6]  # of the pose at the left camera's exposure
     follows = np.linalg.solve(free, shifted).T  # derivative of the pose by the stereo parameters
     if table_view is not None:
         R, t = model.R_left_board[table_view, 0], model.t_left_board[table_view, 0]
@@ -210,7 +181,7 @@ def rig_with_covariance(
         # t_world = t - h R k: a rotation v of R shifts it by -v x (h R k) = (h R k) x v
         M = np.eye(6)
         M[3:, :3] = np.cross(board_thickness * R[:, 2], np.eye(3)).T
-    by_stereo = np.concatenate([basis, M @ follows])
+    by_stereo = np.concatenate([np.eye(N_STEREO), M @ follows])
     covariance = by_stereo @ (inflation * free if stereo is None else stereo) @ by_stereo.T
     covariance[N_STEREO:, N_STEREO:] += inflation * M @ (poses[view, :6, :6] - follows @ shifted) @ M.T
     return replace(rig, covariance=0.5 * (covariance + covariance.T))

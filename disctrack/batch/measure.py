@@ -62,7 +62,7 @@ def do(job: Job) -> Row:
 
 def make_rig(job: Job) -> Row:
     """Calibrate and write job.rig, unless it is already the result of the same inputs."""
-    source = source_of(read_recording(job.folder), job.options.calibration)
+    source = source_of(read_recording(job.folder))
     if is_rig_of(Path(job.rig), source) and not job.options.overwrite:
         return outcome(SKIPPED)
     calibrate_into(Path(job.rig), source, overwrite=True, figures=job.options.report)

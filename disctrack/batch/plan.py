@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from calibration import CalibrationSettings
 from disctrack.analyse.analysis import WINDOW
 from disctrack.batch.columns import Row
 from disctrack.batch.records import Stages, failed
@@ -92,18 +91,11 @@ def find_recordings(folders: Sequence[str | Path], output: str | Path | None = N
 class BatchOptions:
     """Settings of the user for all recordings."""
 
-    distortion: str = "auto"  # see CalibrationSettings
-    board: str = "auto"
     window: float = WINDOW  # [s] before t_f, for the exponents
     report: bool = True  # report.html and figures of each recording
     diagnose: bool = False
     together: bool = False  # in addition, one diagnosis of all recordings
     overwrite: bool = False  # replace existing results
-
-    @property
-    def calibration(self) -> CalibrationSettings:
-        """Settings of every calibration."""
-        return CalibrationSettings(distortion=self.distortion, board=self.board)
 
     @property
     def stages(self) -> Stages:
@@ -161,7 +153,7 @@ def _job(found: FoundRecordings, recording: Recording, name: str, options: Batch
     rig = recording.rig_file
     if rig is None:
         # the folder's name is the hash of all inputs of the calibration
-        made_from = source_of(recording, options.calibration).provenance.fingerprint[:16]
+        made_from = source_of(recording).provenance.fingerprint[:16]
         rig = found.common / "rigs" / made_from / "rig.h5"
         rigs.setdefault(str(rig), Job("rig", name, str(folder), str(rig.parent), str(rig), options))
     return Job("recording", name, str(folder), str(results), str(rig), options)

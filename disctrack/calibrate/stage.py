@@ -9,7 +9,7 @@ from typing import Any
 
 import h5py
 
-from calibration import CalibrationSettings, StereoCalibration, StereoRig
+from calibration import BoardTolerances, StereoCalibration, StereoRig
 from calibration.board import corner_fit
 from calibration.board.search import Progress
 from calibration.board.target import Target, described
@@ -38,12 +38,12 @@ class CalibrationSource:
     board: Target
     table_view: int | None
     board_thickness: float  # [m]
-    settings: CalibrationSettings
+    tolerances: BoardTolerances
 
     def calibrated(self, progress: Progress | None) -> tuple[StereoCalibration, tuple[str, ...]]:
         """Result of `calibrate_views`."""
         table = self.table_view, self.board_thickness
-        return calibrate_views(self.views, self.board, *table, self.settings, progress)
+        return calibrate_views(self.views, self.board, *table, self.tolerances, progress)
 
     @property
     def provenance(self) -> Provenance:
@@ -55,14 +55,12 @@ class CalibrationSource:
                 **described(self.board),
                 "table_view": self.table_view,
                 "board_thickness_m": self.board_thickness,
-                "distortion": self.settings.distortion,
-                "board": self.settings.board,
-                "tolerances": dataclasses.asdict(self.settings.tolerances),
+                "tolerances": dataclasses.asdict(self.tolerances),
             },
         )
 
 
-def source_of(recording: Recording, settings: CalibrationSettings) -> CalibrationSource:
+def source_of(recording: Recording) -> CalibrationSource:
     """Views, board and table of a recording. Raises RecordingError if it names a rig file instead."""
     views, table = recording.views, recording.table
     if views is None or table is None:
@@ -76,13 +74,13 @@ def source_of(recording: Recording, settings: CalibrationSettings) -> Calibratio
         views.target,
         table.view,
         table.board_thickness,
-        dataclasses.replace(settings, tolerances=recording.board_tolerances),
+        recording.board_tolerances,
     )
 
 
 @checked
 def calibrate_recording(
-    recording: Recording, settings: CalibrationSettings | None = None, progress: Progress | None = None
+    recording: Recording, progress: Progress | None = None
 ) -> tuple[StereoCalibration, tuple[str, ...]]:
     """`calibrate_views` with the views, board and table of a recording. Raises RecordingError without them.
 
@@ -90,7 +88,7 @@ def calibrate_recording(
     >>> round(found.rig.baseline, 4)
     0.2955
     """
-    return source_of(recording, settings or CalibrationSettings()).calibrated(progress)
+    return source_of(recording).calibrated(progress)
 
 
 def boards_in(rig_file: Path, recording: Recording) -> Boards | None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from calibration import CalibrationSettings, StereoCalibration, calibrate_stereo
+from calibration import BoardTolerances, StereoCalibration, calibrate_stereo
 from calibration.board.search import Progress
 from calibration.board.target import Target
 from calibration.kit.arguments import Thickness, checked
@@ -137,7 +137,7 @@ def calibrate_views(
     target: Target,
     table_view: int | None = None,
     board_thickness: Thickness = 0.0,
-    settings: CalibrationSettings | None = None,
+    tolerances: BoardTolerances | None = None,
     progress: Progress | None = None,
 ) -> tuple[StereoCalibration, tuple[str, ...]]:
     """Calibrate from files; unreadable views are skipped, and named in the second item.
@@ -171,7 +171,7 @@ def calibrate_views(
         images[1].append(right)
     names = [(str(views.left[i]), str(views.right[i])) for i in used]
     position = None if table_view is None else used.index(table_view)
-    found = calibrate_stereo(*images, target, settings, position, board_thickness, names, progress)
+    found = calibrate_stereo(*images, target, tolerances, position, board_thickness, names, progress)
     return found, tuple(problems)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
-from calibration import CalibrationSettings, StereoRig
+from calibration import StereoRig
 from disctrack.calibrate.stage import boards_in
 from disctrack.commands import DONE, INCOMPLETE
 from disctrack.files.json_text import json_text
@@ -32,11 +32,6 @@ from disctrack.trajectory.file import Details, Provenance, kept_or_made, read_pr
 from disctrack.trajectory.reuse import SUMMARY
 
 RESULTS = "results"
-
-
-def calibration_settings(arguments: argparse.Namespace) -> CalibrationSettings:
-    """Settings of the calibration from the options."""
-    return CalibrationSettings(distortion=arguments.distortion, board=arguments.board)
 
 
 def track_into(

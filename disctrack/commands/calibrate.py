@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from calibration import Board
+from calibration import Board, BoardTolerances
 from disctrack.calibrate.stage import CalibrationSource, calibrate_into, source_of
 from disctrack.calibrate.views import find_views
 from disctrack.commands import _outputs as outputs
@@ -22,7 +22,7 @@ def run(arguments: argparse.Namespace) -> int:
         path = arguments.output or Path("rig.h5")
     else:
         _refuse_options_with_recording(arguments)
-        source = source_of(read_recording(arguments.recording), outputs.calibration_settings(arguments))
+        source = source_of(read_recording(arguments.recording))
         path = arguments.output or arguments.recording / outputs.RESULTS / "rig.h5"
     outputs.check_writable(path.parent)
     _, report = calibrate_into(path, source, arguments.overwrite, not arguments.no_figures, arguments.force)
@@ -40,7 +40,7 @@ def _source_of_patterns(arguments: argparse.Namespace) -> CalibrationSource:
         Board(arguments.corners, arguments.square_mm * 1e-3),
         arguments.table_view,
         (arguments.board_thickness_mm or 0.0) * 1e-3,
-        outputs.calibration_settings(arguments),
+        BoardTolerances(),
     )
 
 

@@ -121,7 +121,6 @@ def add_run(parser: argparse.ArgumentParser) -> None:
     _file(parser, "recording", RECORDING)
     _file(parser, "-o --output", "folder for the results (default: RECORDING/results)")
     _tracking_options(parser)
-    _calibration_options(parser)
 
 
 def add_calibrate(parser: argparse.ArgumentParser) -> None:
@@ -139,7 +138,6 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
     _flag(parser, "--overwrite", "replace a rig made from other views or settings")
     _flag(parser, "--force", "write a rig that is beyond use, too")
     _flag(parser, "--no-figures", "no pictures")
-    _calibration_options(parser)
 
 
 def add_track(parser: argparse.ArgumentParser) -> None:
@@ -196,7 +194,6 @@ def add_batch(parser: argparse.ArgumentParser) -> None:
     _flag(parser, "--together", "also ask it of all together: one answer for many")
     _flag(parser, "--overwrite", "measure anew what is done already")
     _last_seconds(parser, "--window", 0.5, "last seconds for the exponents")
-    _calibration_options(parser)
 
 
 def add_simulate(parser: argparse.ArgumentParser) -> None:
@@ -284,10 +281,3 @@ def _tracking_options(parser: argparse.ArgumentParser) -> None:
     _flag(parser, "--no-figures", "no pictures")
     _flag(parser, "--no-video", "no overlay video")
     _value(parser, "--threads THREADS", _positive, "threads that read and track (default: one per core)")
-
-
-def _calibration_options(parser: argparse.ArgumentParser) -> None:
-    """Common options of `run` and `calibrate`."""
-    group = parser.add_argument_group("calibration")
-    group.add_argument("--distortion", default="auto", metavar="TERMS", help="Brown's terms, e.g. 'k1 k2'; auto: all")
-    group.add_argument("--board", default="auto", metavar="SHAPE", help="flat, warped or free; auto: by held-out error")

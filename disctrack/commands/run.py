@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
         rig, known = given_rig(rig_file)
     else:
         rig_file = folder / "rig.h5"
-        source = source_of(recording, outputs.calibration_settings(arguments))
+        source = source_of(recording)
         rig, known = calibrate_into(rig_file, source, arguments.overwrite, not arguments.no_figures)
     verdict = f"Calibration: {known.verdict}"
     if recording.rig_file is None and not arguments.quiet:  # before the frames, which take longer

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration import CalibrationSettings, StereoCalibration, StereoRig
+from calibration import StereoCalibration, StereoRig
 from calibration.kit.arrays import evenly
 from calibration.rig_file import record_of
 from disctrack.analyse.declaration import Boards, across, contradictions, lost_pairs, turned_board, with_square
@@ -129,7 +129,7 @@ def _rig(seen: Check, recording: Recording) -> StereoRig:
         seen.seen.append(("rig", f"{recording.rig_file}: baseline {1e3 * rig.baseline:.3f} mm"))
         seen.boards = boards_in(recording.rig_file, recording)
         return rig
-    source = source_of(recording, CalibrationSettings())
+    source = source_of(recording)
     views, table = source.views, source.table_view
     assert table is not None
     if table >= len(views):

@@ -21,6 +21,7 @@ def calibration_rows(found: StereoCalibration, problems: Sequence[str] = ()) -> 
     n, assessment = len(found.view_names) + len(problems), found.assessment
     error = f" ({1e6 * assessment.held_out_error:.3g} µm in space)" if np.isfinite(assessment.held_out_error) else ""
     used = n - len(problems) - len(found.rejected_views)
+    x, y, z = 1e6 * np.sqrt(np.mean((found.board_points - found.board.points) ** 2, axis=0))
     lines = [
         (
             "calibration",
@@ -29,7 +30,10 @@ def calibration_rows(found: StereoCalibration, problems: Sequence[str] = ()) -> 
         ),
         ("place", _mostly(assessment.place_sigma, "the calibration alone, of a point over the table's board")),
         ("rig", _rig_text(found.rig)),
-        ("model", _model_text(found)),
+        (
+            "board",
+            f"corners off by {x:.1f}, {y:.1f} and {z:.1f} µm rms along its sides and out of its plane, as refined",
+        ),
     ]
     if found.lens_rms_px:
         left, right = found.lens_rms_px
@@ -62,20 +66,6 @@ def _mostly(sigma: Sequence[tuple[float, str]], what: str) -> str:
     """Each coordinate's sigma and what most of it comes from."""
     parts = [f"{axis} {1e6 * value:.2g} µm from {cause}" for axis, (value, cause) in zip("xyz", sigma, strict=False)]
     return f"{', '.join(parts)} (1 sigma, and its largest part: {what})"
-
-
-def _model_text(found: StereoCalibration) -> str:
-    """Which distortion and which board, and what other boards give on views left out."""
-    chosen = found.refinement.terms
-    text = f"distortion {chosen.distortion}, {chosen.board} board"
-    rows = {c.terms.board: c.held_out_rms_px for c in found.candidates}
-    own = rows.pop(chosen.board, float("nan"))
-    if not rows:
-        return text + (" (as requested)" if found.settings.board != "auto" else " (no other comes near)")
-    listed = ", ".join(f"{board} {rms:.4f}" for board, rms in sorted(rows.items(), key=lambda item: item[1]))
-    return (
-        f"{text}: views left out fit at {own:.4f} px ({listed}); the simplest board that is not clearly worse is taken"
-    )
 
 
 def left_out(found: StereoCalibration) -> list[str]:

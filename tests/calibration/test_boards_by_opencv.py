@@ -10,17 +10,15 @@ from numpy.testing import assert_allclose
 from calibration import (
     Board,
     BoardTolerances,
-    CalibrationSettings,
     Observations,
-    Terms,
     calibrate_from_corners,
     calibrate_from_points,
     refine_stereo,
 )
 from calibration.fit.board_motion import BoardMotion, motions
 from calibration.fit.normal_equations import Problem
-from calibration.fit.priors import BEND, MISPRINT, STRETCH, priors_of
-from calibration.fit.stereo_model import board_basis, moved, predict_pixels
+from calibration.fit.priors import BEND, MISPRINT, STRETCH, board_basis, priors_of
+from calibration.fit.stereo_model import moved, predict_pixels
 from calibration.judge.assessment import stereo_covariance
 from calibration.judge.pairs import motion_between_exposures
 from calibration.rig_file import read_rig_file, write_rig
@@ -31,11 +29,10 @@ from tests.oracles.drawn_boards import make_scene, squared
 
 BOARD = Board(moved_boards.INNER_CORNERS, moved_boards.SQUARE)
 EXACT = BoardTolerances(square=0.0, flatness=0.0, thickness=0.0)
-SETTINGS = CalibrationSettings(distortion="k1 k2 p1 p2", board="flat", tolerances=EXACT)
 
 
-def calibrated_from(left, right, settings=SETTINGS, table_view=None):
-    return calibrate_from_points(left, right, BOARD, moved_boards.IMAGE_SIZE, 0.1, settings, table_view)
+def calibrated_from(left, right, table_view=None):
+    return calibrate_from_points(left, right, BOARD, moved_boards.IMAGE_SIZE, 0.1, EXACT, table_view)
 
 
 def calibrated(rig, n, seed, **motion):
@@ -57,11 +54,12 @@ def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(rng, know
     k = 12 if moving else 6
     deviation = 1e-4 * rng.normal(size=nominal.shape)
     model = moved(scene.model, 1e-4 * rng.normal(size=24), 1e-3 * rng.normal(size=(3, k // 6, 6)), deviation)
-    basis, stereo_basis = board_basis(nominal, "warped" if moving else "free"), Terms("k1").stereo_basis()
-    problem = Problem(observations, np.linalg.inv(observations.covariance), stereo_basis, basis, np.zeros(3, bool))
+    basis = board_basis(nominal)
+    prior = priors_of(scene.model, nominal, basis)
+    problem = Problem(observations, np.linalg.inv(observations.covariance), basis, np.zeros(3, bool), prior)
     problem = {
         "motion": replace(problem, motion=BoardMotion(2e-3, 5e-4)),
-        "prior": replace(problem, prior=replace(priors_of(scene.model, nominal, basis), weight=3.0)),
+        "prior": replace(problem, prior=replace(prior, weight=3.0)),
         "outliers": replace(problem, huber=30.0),
     }[known]
 
@@ -75,14 +73,12 @@ def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(rng, know
         data = np.sum(within * (2 * distance - within))
         if problem.motion is not None:
             data += np.sum(motions(model)[0] ** 2 * problem.motion.weights)
-        if (prior := problem.prior) is not None:
-            data += prior.normal(model, stereo_basis)[-1, -1]
-        return data
+        return data + problem.prior.normal(model)[-1, -1]
 
     assert known != "outliers" or 0.1 < np.mean(distances(model) > problem.huber) < 0.9
     normal = problem.linearise(model)
     assert_allclose(normal.cost, cost(model), rtol=1e-12)
-    s = stereo_basis.shape[1] + basis.shape[-1]
+    s = 24 + basis.shape[-1]
     for direction in rng.normal(size=(6, s + 3 * k)):
         squares = np.einsum("nii->ni", normal.products)[:, :-1]
         direction[:s] /= np.sqrt(squares[:, k:].sum(0) + np.diag(normal.prior)[:-1])
@@ -114,7 +110,7 @@ def test_cameras_and_pair_are_right_where_boards_moved_between_the_exposures():
         # one place of the board for both images, as of cameras that are triggered together
         r, model = found.refinement, found.refinement.model
         as_left = {name: getattr(model, name)[:, [0, 0]] for name in ("R_left_board", "t_left_board")}
-        together = refine_stereo(r.observations, replace(model, **as_left), BOARD.points, r.terms)
+        together = refine_stereo(r.observations, replace(model, **as_left), BOARD.points)
         by_one_place = rig_error(together.model.rig, rig)
         assert np.linalg.norm(error[[0, 1, 4, 5]]) < 0.8 * np.linalg.norm(by_one_place[[0, 1, 9, 10]])
     pair, everything = np.mean(ratios, axis=0)
@@ -130,7 +126,8 @@ def test_boards_that_were_held_still_count_for_more_than_those_that_moved():
     left, right = (np.concatenate(both) for both in zip(still, moving, strict=True))
     found = calibrated_from(left, right)
     pair_weights = found.refinement.problem.motion.pair_weights
-    assert pair_weights[:6].min() > 1.5 * pair_weights[6:].max()
+    # a single board among those that move may be nearly at rest
+    assert np.median(pair_weights[:6]) > 3.0 * np.median(pair_weights[6:])
     error, C = errors(found, rig)
     # the six still pairs alone
     alone, _ = errors(calibrated_from(left[:6], right[:6]), rig)
@@ -149,7 +146,7 @@ def test_pairs_that_were_synchronised_have_no_motion():
             assert not any("synchronised" in text for text in found.warnings)
         # and where one is asked for, it is found to be next to nothing: 0.1 px are 0.07 mm here
         r = found.refinement
-        asked = refine_stereo(r.observations, r.model, BOARD.points, r.terms, motion=BoardMotion(1e-3, 1e-3))
+        asked = refine_stereo(r.observations, r.model, BOARD.points, motion=BoardMotion(1e-3, 1e-3))
         assert asked.problem.motion.shift < 0.1e-3
         assert asked.problem.motion.turn < 0.5e-3
 
@@ -158,20 +155,18 @@ def test_pairs_that_were_synchronised_have_no_motion():
 @pytest.mark.parametrize("seed", [404, 416])
 def test_a_field_of_the_lenses_is_no_motion_of_the_boards(seed, rng):
     plan, draws = point_laboratory.Plan(seed), np.random.default_rng([seed, 11])
-    found = point_laboratory.calibration_of(
-        plan, *point_laboratory.cameras_of(plan, draws), draws, CalibrationSettings()
-    )
+    found = point_laboratory.calibration_of(plan, *point_laboratory.cameras_of(plan, draws), draws)
     assert found.rig.lens_field is not None
     assert found.refinement.problem.motion is None
     assert not any("synchronised" in text for text in found.warnings)
     # without the field it passes for one
     left, right = found.corner_views
-    begun, terms, points = found.refinement.model, found.refinement.terms, found.board.points
-    plain = refine_stereo(_observations((list(left), list(right))), begun, points, terms)
+    begun, points = found.refinement.model, found.board.points
+    plain = refine_stereo(_observations((list(left), list(right))), begun, points)
     assert motion_between_exposures(plain)[0].is_seen
     # and boards that do move are still told: 0.1 px are 25 um here
     moving = [replace(view, points=view.points + 0.1 * rng.normal(size=2)) for view in right]
-    both = calibrate_from_corners(left, moving, found.board, CalibrationSettings(), 0, 3e-3)
+    both = calibrate_from_corners(left, moving, found.board, None, 0, 3e-3)
     assert_allclose(both.refinement.problem.motion.shift, 25e-6, rtol=0.5)
     assert any("synchronised" in text for text in both.warnings)
 
@@ -216,7 +211,7 @@ def calibrated_in_parts(parts, table_view=None, **motion):
     """parts : (rig, number of pairs) in the order in which the views are taken."""
     taken = [moved_boards.pairs(rig, n, 10 + k, **motion) for k, (rig, n) in enumerate(parts)]
     left, right = (np.concatenate(side) for side in zip(*taken, strict=True))
-    return calibrated_from(left, right, SETTINGS, table_view)
+    return calibrated_from(left, right, table_view)
 
 
 def pair_error(found, rig):
@@ -275,52 +270,44 @@ def test_cameras_that_stood_still_are_not_said_to_have_moved(motion):
         assert not found.apart
 
 
-def mean_square(n, distortion="auto", board="auto", rigs=16, displaced=None):
-    """Squared error over stated variance of focal lengths, principal points and pair, mean over rigs; all warnings."""
-    found, told = [], []
-    settings = CalibrationSettings(distortion=distortion, board=board, tolerances=EXACT)
+def mean_square(n, rigs=16, displaced=None):
+    """Squared error over stated variance of focal lengths, principal points and pair, mean over rigs."""
+    found = []
     for seed in range(rigs):
         rig = moved_boards.make_rig(seed)
         points = None if displaced is None else moved_boards.board() + displaced[seed]
-        calibration = calibrated_from(*moved_boards.pairs(rig, n, seed, correlation=0.4, points=points), settings)
+        calibration = calibrated_from(*moved_boards.pairs(rig, n, seed, correlation=0.4, points=points))
         found.append(squared(*errors(calibration, rig)))
-        told.append(" ".join(calibration.warnings))
-    return np.mean(found), told
+    return np.mean(found)
 
 
-# 1.7, 1.2, 1.1; where terms were chosen for each set of views by its held-out error: 2.4, 2.7, 2.0
+def of_paper(size, rng, rigs=16):
+    """(rigs, 54, 3) [m] deviations of boards by a fraction of the largest ones."""
+    basis = board_basis(BOARD.points)
+    return size * np.einsum("nij,rj->rni", basis, rng.normal(size=(rigs, basis.shape[-1])))
+
+
+# with the most likely size of bends and of stretch: 1.8 with five views of paper
 @pytest.mark.statistical
+@pytest.mark.parametrize("size", [0.0, 0.3])
 @pytest.mark.parametrize(("n", "most"), [(3, 2.0), (5, 1.5), (8, 1.4)])
-def test_few_views_are_off_by_what_they_state(n, most):
-    assert 0.5 < mean_square(n)[0] < most
+def test_few_views_are_off_by_what_they_state(n, most, size, rng):
+    assert 0.5 < mean_square(n, displaced=of_paper(size, rng)) < most
 
 
 @pytest.mark.statistical
-def test_terms_that_are_left_out_make_sigmas_too_small():
-    assert mean_square(8, "k1")[0] > 2.0
+@pytest.mark.parametrize("size", [0.3, 0.03, 0.0])
+def test_a_board_that_is_not_as_declared_is_in_the_sigmas(rng, size):
+    assert 0.5 < mean_square(16, 12, of_paper(size, rng)) < 1.4
 
 
-@pytest.mark.statistical
-@pytest.mark.parametrize(("size", "least", "most"), [(1.0, 0.2, 1.2), (0.0, 0.5, 1.4)])
-def test_a_board_that_is_told_to_be_flat_and_is_not_is_in_the_sigmas(rng, size, least, most):
-    smooth = board_basis(BOARD.points, "warped") * 0.1 * np.array([3e-3, 3e-3, 3e-3, 1e-3, 1e-3])  # half a board: 0.1 m
-    displaced = size * (
-        np.einsum("nij,rj->rni", smooth, rng.normal(size=(12, 5))) + 3e-5 * rng.normal(size=(12, 54, 3))
-    )
-    ratio, told = mean_square(16, board="flat", rigs=12, displaced=displaced)
-    assert least < ratio < most  # 2.8 without
-    named = sum("taken as flat, requested, but the views show another shape" in text for text in told)
-    assert named >= 8 if size else named == 0  # where a small bend pulls by less than a sigma, nothing is said
-
-
-@pytest.mark.parametrize("model", ["warped", "free"])
-def test_what_is_known_of_a_board_is_the_same_whichever_model_has_it(model):
+def test_what_is_known_of_a_board_is_its_bend_its_stretch_and_its_misprints():
     nominal = BOARD.points
     at = make_scene(n_views=1).model
-    prior, free = priors_of(at, nominal, board_basis(nominal, model)), Terms().stereo_basis()
+    prior = priors_of(at, nominal, board_basis(nominal))
 
     def cost(points):
-        own, declared = (prior.normal(replace(at, points=p), free)[-1, -1] for p in (points, nominal))
+        own, declared = (prior.normal(replace(at, points=p))[-1, -1] for p in (points, nominal))
         return own - declared
 
     d, size = nominal - nominal.mean(0), 0.1  # half of eight squares of 25 mm
@@ -328,8 +315,7 @@ def test_what_is_known_of_a_board_is_the_same_whichever_model_has_it(model):
     bent = nominal + BEND * size * (d[:, :1] / size) ** 2 * [0.0, 0.0, 1.0]
     for points in (stretched, bent):
         assert_allclose(cost(points), 1.0, rtol=1e-6)
-    if model == "free":
-        one = nominal.copy()
-        one[20, 0] += size * MISPRINT
-        # what of a single corner's misprint is no shift, turn, size or smooth shape of the board
-        assert 0.85 < cost(one) < 1.0
+    one = nominal.copy()
+    one[20, 0] += size * MISPRINT
+    # what of a single corner's misprint is no shift, turn, size or smooth shape of the board
+    assert 0.85 < cost(one) < 1.0

@@ -7,13 +7,12 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.interpolate import BSpline
 
-from calibration import Terms, refine_stereo, triangulate
+from calibration import refine_stereo, triangulate
 from calibration.cameras.splines import LensField
 from calibration.fit.lens_field import fit_lens_field
 from tests.oracles.drawn_boards import make_scene
 
 SIGMA = 0.004  # [px] of good corners
-TERMS = Terms("k1 k2 p1 p2", "flat")
 
 
 def field_of(pixels, camera):
@@ -30,7 +29,7 @@ def refined():
     o = scene.observations(SIGMA, np.random.default_rng(3))
     moved = np.where((o.camera == 0)[:, None], field_of(o.pixels, 0), field_of(o.pixels, 1))
     bent = replace(o, pixels=o.pixels + moved)
-    return scene, [refine_stereo(seen, scene.model, scene.board.points, TERMS) for seen in (o, bent)]
+    return scene, [refine_stereo(seen, scene.model, scene.board.points) for seen in (o, bent)]
 
 
 def test_a_field_is_of_cubic_splines_whose_first_node_lies_one_spacing_before_the_image(rng):
@@ -45,7 +44,7 @@ def test_a_field_is_of_cubic_splines_whose_first_node_lies_one_spacing_before_th
 
 def test_field_is_found_and_the_geometry_is_better_for_it(refined):
     scene, (_, bent) = refined
-    field, corrected = fit_lens_field(bent, scene.board.points)
+    field, corrected = fit_lens_field(bent)
     assert field is not None
     # all that is left is the corners' own noise: 0.5 to 2 times SIGMA, unequal on the axes
     assert bent.chi_square > 3
@@ -70,13 +69,13 @@ def test_what_varies_within_a_cell_is_found_too():
     scene = make_scene(n_views=16)
     o = scene.observations(SIGMA, np.random.default_rng(4))
     waves = np.sin(o.pixels @ [[0.035, 0.02], [0.015, -0.038]] + o.camera[:, None])
-    bent = refine_stereo(replace(o, pixels=o.pixels + 0.03 * waves), scene.model, scene.board.points, TERMS)
-    found = fit_lens_field(bent, scene.board.points)[1].chi_square
+    bent = refine_stereo(replace(o, pixels=o.pixels + 0.03 * waves), scene.model, scene.board.points)
+    found = fit_lens_field(bent)[1].chi_square
     assert found < 1.5
 
 
 def test_plain_lenses_and_few_views_get_no_field(refined):
     scene, (plain, bent) = refined
-    assert fit_lens_field(plain, scene.board.points) == (None, plain)
+    assert fit_lens_field(plain) == (None, plain)
     few = bent.observations[bent.observations.view < 6]
-    assert fit_lens_field(refine_stereo(few, bent.model, scene.board.points, TERMS), scene.board.points)[0] is None
+    assert fit_lens_field(refine_stereo(few, bent.model, scene.board.points))[0] is None

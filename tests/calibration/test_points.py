@@ -6,28 +6,27 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration import Board, CalibrationError, CalibrationSettings, calibrate_from_points
+from calibration import Board, CalibrationError, calibrate_from_points
 from tests.oracles import moved_boards
 from tests.oracles.drawn_boards import make_scene
-
-PLAIN = CalibrationSettings("k1 k2 p1 p2", "flat")
 
 
 def noisy(scene, rng, sigma):
     return [[p + rng.normal(size=p.shape) * sigma for p in scene.pixels(camera)] for camera in (0, 1)]
 
 
+@pytest.mark.statistical
 def test_points_and_one_sigma_give_the_rig_and_say_that_the_noise_was_overstated(rng):
     scene = make_scene(n_views=8)
     left, right = noisy(scene, rng, 0.04)
     left[3] = None
-    found = calibrate_from_points(left, right, scene.board, (512, 512), 0.04, PLAIN)
+    found = calibrate_from_points(left, right, scene.board, (512, 512), 0.04)
     t = scene.model.rig.t_right_left
     C = found.rig.covariance[21:24, 21:24]
     error = found.rig.t_right_left - t
     assert error @ np.linalg.solve(C, error) < 16  # chi-square of three
     assert not any("declared" in w for w in found.warnings)
-    careful = calibrate_from_points(left, right, scene.board, ((512, 512), (512, 512)), 0.1, PLAIN)
+    careful = calibrate_from_points(left, right, scene.board, ((512, 512), (512, 512)), 0.1)
     assert any("0.1 px were declared" in w for w in careful.warnings)
     assert_allclose(careful.rig.t_right_left, found.rig.t_right_left, atol=1e-5)
 
@@ -38,7 +37,7 @@ def test_what_cannot_be_right_is_named(rng):
 
     def refused(match, left=left, right=right, board=scene.board, size=(512, 512), sigma=0.04):
         with pytest.raises(CalibrationError, match=match):
-            calibrate_from_points(left, right, board, size, sigma, PLAIN)
+            calibrate_from_points(left, right, board, size, sigma)
 
     refused("5 left and 4 right views", right=right[:-1])
     refused("right view 2: corners of shape \\(53, 2\\)", right=[*right[:2], right[2][1:], *right[3:]])
@@ -65,8 +64,7 @@ def test_a_lens_wider_than_the_model_is_named(distortion, named):
     t_pair = np.array([-0.06, 0.002, 0.001])
     rig = SimpleNamespace(left=lens, right=lens, R_right_left=np.eye(3), t_right_left=t_pair)
     corners = moved_boards.pairs(rig, 14, 1, places=((-0.25, 0.25), (-0.14, 0.14), (0.14, 0.3)))
-    settings = CalibrationSettings(distortion="k1 k2 p1 p2 k3", board="flat")
-    found = calibrate_from_points(*corners, Board((9, 6), 25e-3), lens.image_size, 0.1, settings)
+    found = calibrate_from_points(*corners, Board((9, 6), 25e-3), lens.image_size, 0.1)
     told = [text for text in found.warnings if "wider than the model" in text]
     assert len(told) == (2 if named else 0), found.warnings
     assert ("wider than the model" in found.assessment.verdict) == named

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from calibration import BoardNotFound, CalibrationSettings, RigFileError, calibrate_from_corners
+from calibration import BoardNotFound, RigFileError, calibrate_from_corners
 from calibration.cameras.camera import N_RIG, Allowance, rotation_from_vector
 from calibration.cameras.splines import LensField
 from calibration.rig_file import read_rig, read_rig_file, record_of, write_rig
@@ -33,7 +33,7 @@ def calibrated():
     sides[0][2] = BoardNotFound("glare")
     sides[1][5] = replace(sides[1][5], points=sides[1][5].points + np.array([40.0, 0.0]))
     names = [(f"l{v}.png", f"rechts ü{v}.png") for v in range(8)]
-    return calibrate_from_corners(*sides, scene.board, CalibrationSettings("k1", "flat"), 1, 3e-3, names)
+    return calibrate_from_corners(*sides, scene.board, None, 1, 3e-3, names)
 
 
 @pytest.fixture

@@ -10,7 +10,6 @@ from calibration import (
     Board,
     BoardNotFound,
     CalibrationError,
-    CalibrationSettings,
     Camera,
     calibrate_from_corners,
     calibrate_stereo,
@@ -25,7 +24,6 @@ BOARD = Board((7, 4), 9e-3)
 THICKNESS = 2e-3
 NAMES = [(f"left {v}", f"right {v}") for v in range(20)]
 EXACT = BoardTolerances(square=0.0, flatness=0.0, thickness=0.0)  # what is declared of a drawn board is true
-FLAT = CalibrationSettings(distortion="k1", board="flat", tolerances=EXACT)
 
 
 def small_scene(**options):
@@ -59,7 +57,7 @@ def corner_views(scene, rng, sigma=0.02):
 
 def test_lab_frame_from_images_is_right_within_its_uncertainty(drawn):
     scene, (left, right) = drawn
-    found = calibrate_stereo(left, right, BOARD, FLAT, table_view=3, board_thickness=THICKNESS)
+    found = calibrate_stereo(left, right, BOARD, EXACT, table_view=3, board_thickness=THICKNESS)
     R, t = table_pose(scene.model.R_left_board[3, 0], scene.model.t_left_board[3, 0], THICKNESS)
     points = np.array([[0.0, 0, 0], [50e-3, 0, 0], [0, 25e-3, 0], [25e-3, 10e-3, 10e-3]])
     m = scene.model
@@ -82,7 +80,7 @@ def test_a_view_of_another_size_is_named_and_one_too_few(drawn):
 def test_views_without_a_board_are_left_out_with_the_reason(drawn):
     _, (left, right) = drawn
     blank = np.full_like(left[0], 90)
-    found = calibrate_stereo([*left[:6], blank, left[7]], [*right[:5], blank, blank, right[7]], BOARD, FLAT)
+    found = calibrate_stereo([*left[:6], blank, left[7]], [*right[:5], blank, blank, right[7]], BOARD, EXACT)
     assert list(found.rejected_views) == [6]
     assert "left 6 and right 6: no board of 7 x 4" in found.rejected_views[6]
     said = "right 5: left out, the other image of the pair is used for its own camera: no board"
@@ -98,16 +96,16 @@ def test_no_board_anywhere_and_none_in_the_table_view_are_errors(drawn):
     with pytest.raises(CalibrationError, match=r"found in 0 of 8 left images.*left 0 and 7 more: no board"):
         calibrate_stereo([blank] * 8, right, BOARD)
     with pytest.raises(CalibrationError, match=r"table view 0 cannot be used .left 0 and right 0: no board.*lab frame"):
-        calibrate_stereo([blank, *left[1:]], [blank, *right[1:]], BOARD, FLAT, table_view=0)
+        calibrate_stereo([blank, *left[1:]], [blank, *right[1:]], BOARD, EXACT, table_view=0)
     with pytest.raises(CalibrationError, match="table view 11 does not exist"):
-        calibrate_stereo(left, right, BOARD, FLAT, table_view=11)
+        calibrate_stereo(left, right, BOARD, EXACT, table_view=11)
 
 
 def test_exchanged_images_are_found_out(rng):
     scene = small_scene(n_views=10)
     left, right = corner_views(scene, rng)
     right[2], right[7] = right[7], right[2]
-    found = calibrate_from_corners(left, right, BOARD, FLAT)
+    found = calibrate_from_corners(left, right, BOARD, EXACT)
     assert found.apart == (2, 7)
     assert any("not a pair" in text and "left 2 " in text and "left 7 " in text for text in found.warnings)
     assert not found.rejected_views  # each image still says all that it can of its own camera
@@ -115,7 +113,7 @@ def test_exchanged_images_are_found_out(rng):
     assert found.rms_px < 0.05
     assert np.isfinite(found.rms_per_view_px).all()
     with pytest.raises(CalibrationError, match="table view 2 cannot be used"):
-        calibrate_from_corners(left, right, BOARD, FLAT, table_view=2)
+        calibrate_from_corners(left, right, BOARD, EXACT, table_view=2)
 
 
 @pytest.mark.statistical
@@ -136,12 +134,12 @@ def test_an_image_whose_corners_are_wrong_costs_itself_alone_however_wrong_they_
 def test_a_board_that_moved_between_the_exposures_costs_the_pair_and_no_camera(rng):
     left, right = corner_views(small_scene(n_views=10), rng)
     right[4] = replace(right[4], points=right[4].points + np.array([1.5, -1.0]))
-    found = calibrate_from_corners(left, right, BOARD, FLAT)
+    found = calibrate_from_corners(left, right, BOARD, EXACT)
     assert found.apart == (4,)
     assert found.assessment.pairs == 9
     assert any(text.startswith("left 4 and right 4 (") and "moved" in text for text in found.warnings)
     left[4] = right[4] = BoardNotFound("left out")
-    without = calibrate_from_corners(left, right, BOARD, FLAT)
+    without = calibrate_from_corners(left, right, BOARD, EXACT)
     sigma = np.sqrt(np.diag(without.rig.covariance))[:9]
     change = found.rig.left.parameters - without.rig.left.parameters
     assert np.abs(change[sigma > 0] / sigma[sigma > 0]).max() < 2
@@ -151,7 +149,7 @@ def test_a_board_that_moved_between_the_exposures_costs_the_pair_and_no_camera(r
 def test_so_few_pairs_that_none_can_judge_another_are_all_used(rng):
     left, right = corner_views(small_scene(n_views=3), rng)
     right[1] = replace(right[1], points=right[1].points + np.array([1.5, -1.0]))
-    assert not calibrate_from_corners(left, right, BOARD, FLAT).apart
+    assert not calibrate_from_corners(left, right, BOARD, EXACT).apart
 
 
 @pytest.mark.statistical
@@ -161,8 +159,8 @@ def test_parallel_views_are_warned_of(rng):
     shift = rng.uniform(-0.02, 0.02, (8, 3))
     turns = rotation_from_vector(np.outer(np.arange(8), [0, 0, 0.1]))[:, None]
     parallel = replace(m, R_left_board=m.R_left_board[0] @ turns, t_left_board=m.t_left_board[0] + shift[:, None])
-    found = calibrate_from_corners(*corner_views(replace(scene, model=parallel), rng), BOARD, FLAT)
-    many = calibrate_from_corners(*corner_views(scene, rng), BOARD, FLAT)
+    found = calibrate_from_corners(*corner_views(replace(scene, model=parallel), rng), BOARD, EXACT)
+    many = calibrate_from_corners(*corner_views(scene, rng), BOARD, EXACT)
     assert found.assessment.tilt_spread_deg < 1
     assert any("normals differ" in w for w in found.warnings)
     assert not any("normals differ" in w for w in many.warnings)
@@ -182,7 +180,7 @@ def test_a_board_that_looks_the_same_after_a_turn_still_gives_one_pair(rng, coun
     orders = board_orders(counts)
     orders = orders if len(board.orders) == len(orders) else orders[::2]
     turned = [view.reordered(orders[v % len(orders)]) for v, view in enumerate(right)]
-    found = calibrate_from_corners(left, turned, board, CalibrationSettings("k1 k2 p1 p2", "flat"))
+    found = calibrate_from_corners(left, turned, board)
     assert not found.rejected_views
     assert found.rms_px < 0.03
     assert any("looks the same after a turn" in w for w in found.warnings)
@@ -206,22 +204,18 @@ def test_one_camera_that_shows_a_mirror_image_is_named_and_two_are_one_world(rng
     mirrored = [[in_a_mirror(view, board) for view in side] for side in sides]
     for pair in ((sides[0], mirrored[1]), (mirrored[0], sides[1])):
         with pytest.raises(CalibrationError, match=r"images of one of the two cameras are mirrored: if they are, 9 of"):
-            calibrate_from_corners(*pair, board, FLAT)
-    assert calibrate_from_corners(*mirrored, board, FLAT).rms_px < 0.2
+            calibrate_from_corners(*pair, board, EXACT)
+    assert calibrate_from_corners(*mirrored, board, EXACT).rms_px < 0.2
 
 
 def test_the_images_of_one_camera_twice_are_no_pair(rng):
     left, right = corner_views(small_scene(n_views=6), rng, 0.02)
     with pytest.raises(CalibrationError, match=r"from one place .* do both patterns name the images of one camera"):
-        calibrate_from_corners(left, left, BOARD, FLAT)
-    assert calibrate_from_corners(left, right, BOARD, FLAT).rms_px < 0.1
+        calibrate_from_corners(left, left, BOARD, EXACT)
+    assert calibrate_from_corners(left, right, BOARD, EXACT).rms_px < 0.1
 
 
-def test_unknown_settings_are_refused():
-    with pytest.raises(CalibrationError, match="k1 k2"):
-        CalibrationSettings(distortion="k7")
-    with pytest.raises(CalibrationError, match="flat"):
-        CalibrationSettings(board="round")
+def test_boards_that_are_none_are_refused():
     with pytest.raises(CalibrationError, match="3 x 3"):
         Board((2, 9), 1e-3)
     with pytest.raises(CalibrationError, match="positive"):
@@ -248,12 +242,12 @@ def views():
 )
 def test_views_that_are_no_pairs_are_named(views, paired, said):
     with pytest.raises(CalibrationError, match=said):
-        calibrate_from_corners(*paired(*views), BOARD, FLAT)
+        calibrate_from_corners(*paired(*views), BOARD, EXACT)
 
 
 def test_a_frame_that_was_lost_near_the_end_costs_the_pairs_behind_it_and_is_named(views):
     left, right = views
-    found = calibrate_from_corners(left[:-1], [*right[:7], *right[8:]], BOARD, FLAT)
+    found = calibrate_from_corners(left[:-1], [*right[:7], *right[8:]], BOARD, EXACT)
     assert found.apart == (7, 8, 9, 10)
     (text,) = [text for text in found.warnings if "a frame was lost there" in text]
     # the right view of left 7 is lost itself
@@ -268,7 +262,7 @@ def test_boards_of_two_sizes_end_in_a_rig_or_a_sentence(views):
     far = replace(m, points=1.5 * m.points, t_left_board=m.t_left_board + np.array([0, 0, 0.05]))
     other = corner_views(replace(scene, model=far), np.random.default_rng(4))
     mixed = [[b if v % 3 == 1 else a for v, (a, b) in enumerate(zip(*s, strict=True))] for s in zip(views, other)]  # noqa: B905
-    found = calibrate_from_corners(*mixed, BOARD, FLAT)
+    found = calibrate_from_corners(*mixed, BOARD, EXACT)
     assert found.apart == (1, 4, 7, 10)
     assert_allclose(found.rig.baseline, m.rig.baseline, rtol=0.01)
 
@@ -283,7 +277,7 @@ def test_every_pair_of_a_square_board_is_used_whichever_way_a_camera_sees_it(rng
     views = corner_views(scene.with_rig(R_right_left=near, t_right_left=np.array([-0.02, 0.0, 0.002])), rng, 0.1)
     for turned in (0, 1):  # and the right camera upside down
         right = [view.reordered(board.orders[(turned + v // 3) % len(board.orders)]) for v, view in enumerate(views[1])]
-        found = calibrate_from_corners(views[0], right, board, CalibrationSettings("k1", "flat"))
+        found = calibrate_from_corners(views[0], right, board)
         assert not found.apart
         assert found.assessment.pairs == 16
         assert found.rms_px < 0.2
@@ -292,8 +286,8 @@ def test_every_pair_of_a_square_board_is_used_whichever_way_a_camera_sees_it(rng
 
 @pytest.mark.statistical
 def test_views_of_one_place_count_once(views):
-    once = calibrate_from_corners(*views, BOARD, FLAT)
-    thrice = calibrate_from_corners(*[3 * side for side in views], BOARD, FLAT, table_view=14)
+    once = calibrate_from_corners(*views, BOARD, EXACT)
+    thrice = calibrate_from_corners(*[3 * side for side in views], BOARD, EXACT, table_view=14)
     assert len(thrice.rejected_views) == 24
     assert 14 not in thrice.rejected_views
     assert thrice.rejected_views[2] == "left 2: shows the board where left 14 does, and counts once; " + (
@@ -306,14 +300,14 @@ def test_views_of_one_place_count_once(views):
     # a board at rest in a video: other noise in every frame, the same place
     scene = small_scene(n_views=12)
     again = corner_views(scene, np.random.default_rng(9))
-    rest = calibrate_from_corners(*[a + b for a, b in zip(views, again, strict=True)], BOARD, FLAT)
+    rest = calibrate_from_corners(*[a + b for a, b in zip(views, again, strict=True)], BOARD, EXACT)
     assert len(rest.rejected_views) == 12
 
 
 def test_an_image_that_is_missing_makes_no_two_views_one(views):
     left, right = views
     left = [BoardNotFound("covered") if v == 3 else view for v, view in enumerate(left)]
-    found = calibrate_from_corners(left, right, BOARD, FLAT)
+    found = calibrate_from_corners(left, right, BOARD, EXACT)
     assert not found.rejected_views
     assert not found.apart
     assert not any("frame was lost" in text for text in found.warnings)
@@ -329,7 +323,7 @@ def test_a_lens_that_was_zoomed_between_the_views_is_named_and_costs_its_later_i
     left, before = corner_views(scene, np.random.default_rng(0))
     after = corner_views(zoomed, np.random.default_rng(1))[1]
     right_views = [*before[:12], *after[12:]]
-    found = calibrate_from_corners(left, right_views, board, CalibrationSettings(board="flat"))
+    found = calibrate_from_corners(left, right_views, board)
     (text,) = [text for text in found.warnings if "zoomed" in text]
     assert text.startswith("right 12, right 13")
     assert "the right camera was zoomed or focused anew" in text
@@ -340,6 +334,7 @@ def test_a_lens_that_was_zoomed_between_the_views_is_named_and_costs_its_later_i
     assert np.abs((found.rig.t_right_left - m.rig.t_right_left) / sigma[21:24]).max() < 4
 
 
+@pytest.mark.statistical
 def test_images_of_half_the_size_are_no_better_a_calibration():
     """The same cameras with half the pixels, corners as uncertain in space: the same verdict, half the misfit in px."""
     scene = small_scene(n_views=12)
@@ -351,7 +346,7 @@ def test_images_of_half_the_size_are_no_better_a_calibration():
     found = []
     for one, sigma in ((scene, 0.1), (scene.with_rig(left=half[0], right=half[1]), 0.05)):
         sides = corner_views(one, np.random.default_rng(2), sigma)
-        found.append(calibrate_from_corners(*sides, BOARD, FLAT).assessment)
+        found.append(calibrate_from_corners(*sides, BOARD, EXACT).assessment)
     whole, less = found
     assert less.verdict.split(":")[0] == whole.verdict.split(":")[0]
     assert_allclose(less.stereo_misfit_px, 0.5 * whole.stereo_misfit_px, rtol=0.05)
@@ -362,7 +357,7 @@ def test_images_of_half_the_size_are_no_better_a_calibration():
 
 
 def test_a_rig_is_beyond_use_where_points_are_off_by_a_twentieth_of_their_distance(views):
-    good = calibrate_from_corners(*views, BOARD, FLAT).assessment
+    good = calibrate_from_corners(*views, BOARD, EXACT).assessment
     assert not good.beyond_use
     assert replace(good, triangulation_sigma=(0.06 * good.distance, 1.0)).beyond_use
     assert replace(good, held_out_error=0.06 * good.distance).beyond_use

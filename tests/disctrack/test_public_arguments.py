@@ -14,7 +14,7 @@ import calibration
 import disctrack
 from disctrack.errors import ArgumentError
 
-MADE = {"Board", "CalibrationSettings", "Camera", "Observations", "StereoRig"}
+MADE = {"Board", "Camera", "Observations", "StereoRig"}
 MADE |= {"Disc", "Model", "Provenance", "State", "Tracker"}
 OFFERED = {name: getattr(package, name) for package in (calibration, disctrack) for name in package.__all__}
 PUBLIC = {name: item for name, item in OFFERED.items() if inspect.isfunction(item) or name in MADE}

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calibration import Board, CalibrationSettings, calibrate_from_corners
+from calibration import Board, calibrate_from_corners
 from disctrack.disc import MA_2014
 from disctrack.frames import rotation_from_quaternion, vector_from_rotation
 from disctrack.track.dots._kernels import DOT
@@ -25,7 +25,6 @@ from tests.oracles.drawn_boards import corner_view
 G = 9.81
 BOARD_THICKNESS = 3e-3
 CORNER_PX, DOT_PX = 0.0024, 0.0045  # noise per axis of corners and dots in good images
-TERMS = {True: ("k1 k2 p1 p2 k3", "free"), False: ("k1 k2", "flat")}  # as views left out choose them here
 GAUSS = ((-0.7745966692414834, 5 / 18), (0.0, 8 / 18), (0.7745966692414834, 5 / 18))
 
 
@@ -120,7 +119,7 @@ def board_pose(view, plan, target, rng):
     return R, place - R @ np.array([*(0.5 * plan.board_size), 0.0])
 
 
-def calibration_of(plan, cameras, target, rng, settings=None):
+def calibration_of(plan, cameras, target, rng):
     """The rig from views of the board, which is bowed along its long side, and longer there than declared."""
     board = Board(plan.inner_corners, plan.square)
     x, y, _ = board.points.T
@@ -131,9 +130,7 @@ def calibration_of(plan, cameras, target, rng, settings=None):
         for side, camera in zip(views, cameras, strict=True):
             seen = camera.project(points @ R.T + t) + CORNER_PX * rng.normal(size=(len(points), 2))
             side.append(corner_view(seen, CORNER_PX, (camera.size, camera.size)))
-    if settings is None:
-        settings = CalibrationSettings(*TERMS[plan.lens_field > 0])
-    return calibrate_from_corners(*views, board, settings, 0, BOARD_THICKNESS)
+    return calibrate_from_corners(*views, board, None, 0, BOARD_THICKNESS)
 
 
 def pose_of(q):

@@ -34,7 +34,7 @@ from disctrack.batch.records import MEASURED, is_done, read_row
 from disctrack.processes import Spawn
 from disctrack.track.follow.tracking import prepare
 from disctrack.trajectory.file import read_trajectory
-from tests.pipeline.conftest import MODEL, linked
+from tests.pipeline.conftest import linked
 
 FAST = ["--no-report"]
 
@@ -74,7 +74,7 @@ def test_a_batch_calibrates_a_rig_once_tells_of_every_recording_and_goes_on_wher
     root = a_day(short_recording, tmp_path / "day", ("r2", "r10", "bad toml"))
     replace(root / "bad toml" / "recording.toml", b"x = = 3")
     replace(root / "r10" / "left" / "000005.png", b"junk")
-    said, errors = cli("batch", root, "-j", "2", *FAST, *MODEL, code=1)
+    said, errors = cli("batch", root, "-j", "2", *FAST, code=1)
     assert re.search(r"refusal +bad toml \(failed\).*not valid TOML", said, re.DOTALL)
     assert re.search(r"r10 \(measured\).*000005.png", said, re.DOTALL)
     assert "2 measured, 1 failed" in said
@@ -97,7 +97,7 @@ def test_a_batch_calibrates_a_rig_once_tells_of_every_recording_and_goes_on_wher
     page = (root / "batch_results" / "index.html").read_text()
     assert all(name in page for name in rows)
     replace(root / "bad toml" / "recording.toml", (root / "r2" / "recording.toml").read_bytes())
-    assert "1 measured, 2 measured before" in cli("batch", root, *FAST, *MODEL, code=3).out  # r10 lacks an image
+    assert "1 measured, 2 measured before" in cli("batch", root, *FAST, code=3).out  # r10 lacks an image
 
 
 @pytest.fixture

@@ -38,8 +38,8 @@ def test_run_calibrates_tracks_draws_and_tells(short_recording, tmp_path, cli):
         assert word in everything
     # where stderr is no terminal: no bars, one line for each stage when it has ended, and how good the calibration is
     stages = "".join(line for line in errors.splitlines(True) if "inner loops" not in line)  # if compiled only now
-    stage = r" *[0-9.]+ s  (calibrate|track|video): \d+ \w+\n"
-    assert re.fullmatch(rf"{stage}Calibration: .+\n({stage}){{2}}", stages), errors
+    stage = r" *[0-9.]+ s  (calibrate|track|figures|video): \d+ \w+\n"
+    assert re.fullmatch(rf"{stage}Calibration: .+\n({stage}){{3}}", stages), errors
     trajectory = read_trajectory(results / "trajectory.h5")
     assert (trajectory.frame_status == FrameStatus.MEASURED).all()
     # the height of the centre follows from the nutation in rolling contact (z = r sin theta + h cos theta)
@@ -134,8 +134,7 @@ def test_calibrate_without_a_recording(shared_data, tmp_path, cli):
     folder = shared_data / "opencv_stereo_chessboard"
     path = tmp_path / "rig.h5"
     words = "--left", folder / "left*.jpg", "--right", folder / "right*.jpg", "--corners", "9x6", "--square-mm", "25"
-    model = "--distortion", "k1 k2", "--board", "flat"  # choosing takes longer
-    output = cli("calibrate", *words, "-o", path, *model, "--no-figures", "-v").out
+    output = cli("calibrate", *words, "-o", path, "--no-figures", "-v").out
     baseline = float(output.split("baseline")[1].split("mm")[0])
     assert 83.1 < baseline < 83.4  # reference.json beside the photographs: 83.2-83.3
     assert path.exists()

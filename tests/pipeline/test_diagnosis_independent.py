@@ -16,7 +16,7 @@ from disctrack.synthetic.recording import write_recording
 from disctrack.validate.rendered import scene_of
 from tests.oracles import newton_euler
 from tests.oracles.newton_euler import LEAD, of_the_paper
-from tests.pipeline.conftest import MODEL, QUICK
+from tests.pipeline.conftest import QUICK
 
 
 def small_scene(seed, n_frames, frame_rate):
@@ -38,7 +38,7 @@ def hide(folder, scene, body):
 
 def diagnosis_of(recording):
     out = recording.parent / "out"
-    assert main(["run", str(recording), "-o", str(out), *QUICK, *MODEL]) in (0, 3)
+    assert main(["run", str(recording), "-o", str(out), *QUICK]) in (0, 3)
     # a hollow table is a doubt about the thickness of the disc to the tracking: diagnosed anyway, and told again
     asked = ["-o", str(out / "diagnosis"), "--anyway"]
     assert main(["diagnose", str(out / "trajectory.h5"), *asked]) in (0, 3)

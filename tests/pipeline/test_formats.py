@@ -21,7 +21,7 @@ from disctrack.trajectory.file import read_details
 from tests.disctrack.recording.readers.written import write_hdf5
 from tests.equality import assert_equal
 from tests.oracles.camera_files import write_mraw
-from tests.pipeline.conftest import MODEL, QUICK, linked
+from tests.pipeline.conftest import QUICK, linked
 
 CAMERAS = ("left", "right")
 OURS = {"Record_Rate": "1000", "Shutter_Type2": "50000"}  # of a Photron header: as declared, and 50 µs
@@ -115,7 +115,7 @@ def test_chessboard_views_in_one_file_per_camera_give_the_same_rig(short_recordi
     write_hdf5(tmp_path / "right.h5", views["right"], compression="gzip")
     text = text.replace("calibration/left/*.png", "left.cih").replace("calibration/right/*.png", "right.h5")
     (tmp_path / "recording.toml").write_text(text)
-    assert main(["calibrate", str(tmp_path), "-o", str(tmp_path / "rig.h5"), *MODEL, "--no-figures"]) == 0
+    assert main(["calibrate", str(tmp_path), "-o", str(tmp_path / "rig.h5"), "--no-figures"]) == 0
     assert_equal(read_rig(tmp_path / "rig.h5"), read_rig(rig_file))
 
 
