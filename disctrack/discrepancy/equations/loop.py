@@ -24,7 +24,7 @@ from disctrack.discrepancy.noise import (
     with_noise,
 )
 from disctrack.discrepancy.score import Linearisation
-from disctrack.discrepancy.search import WIDTH, Diagnosis, Former, Settings, explain, with_shapes
+from disctrack.discrepancy.search import WIDTH, Diagnosis, Former, Settings, explain
 from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import USED_UP, Candidate, System, Values
 from disctrack.errors import AnalysisError
@@ -72,8 +72,7 @@ def find_missing(
     if law is not None and named:
         judged = law.system if judged is system else judged.over(law.system)
         system, diagnosis = law.system, with_law(diagnosis, law)
-    elif diagnosis.found and (diagnosis.verdict == "found" or any(f.candidate.shape for f in diagnosis.found)):
-        diagnosis = with_shapes(judged, diagnosis)
+    else:
         notes += diagnosis.remarks
     notes += [] if system.budget.open() else [USED_UP]
     if system.held:
