@@ -169,7 +169,8 @@ def whiteness(residual: Array, rate: float, lines: Mapping[str, float], lags: in
     mean = np.where(power.mean(axis=0) > 0, power.mean(axis=0), 1.0)
     top = power.argmax(axis=0)
     height = power.max(axis=0) / mean
-    peak_p = -np.expm1(len(frequency) * np.log1p(-np.exp(-height)))  # Fisher's g, large n
+    with np.errstate(divide="ignore"):  # a channel without power, as of a camera that sees nothing, has p = 1
+        peak_p = -np.expm1(len(frequency) * np.log1p(-np.exp(-height)))  # Fisher's g, large n
     resolution = 1.5 * rate / n
     near = tuple(next((name for name, f in lines.items() if abs(f - frequency[i]) <= resolution), "") for i in top)
     return Whiteness(statistic, p, frequency[top], np.asarray(peak_p, float), near)
