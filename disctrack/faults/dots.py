@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.cameras.camera import Camera, StereoRig, placed_at, project_with_jacobians
+from calibration.cameras.camera import Camera, StereoRig, by_turning, placed_at, project_with_jacobians
 from calibration.kit.arrays import Array
 from disctrack.disc import Disc
 from disctrack.faults.keys import Faults
@@ -56,20 +56,25 @@ class Sight:
     by_pose: Array  # (n, 2, m, 2, 6) their derivatives by the POSE_COMPONENTS
 
 
-def predict(R: Array, t: Array, rig: StereoRig, disc: Disc, faults: Faults) -> tuple[Array, Array]:
-    """Images of the centres of the dots (n, 2, m, 2), and derivatives (n, 2, m, 2, 6) by the POSE_COMPONENTS.
+def marker_pixels(R: Array, t: Array, rig: StereoRig, centres_body: Array) -> tuple[Array, Array]:
+    """Images of the dots' centres (n, 2, m, 2), and derivatives (n, 2, m, 2, 6) by POSE_COMPONENTS.
 
-    R (2, n, 3, 3), t (2, n, 3): poses per camera, body -> world. Faults of clocks and images are not included.
+    R (n, 3, 3), t (n, 3), or (2, n, ...) per camera: body -> world; centres_body (m, 3). NaN behind a camera.
     """
-    centres, rig = centres_with(faults, disc), cameras_with(faults, rig)
     pixels, by_pose = [], []
-    for i, (camera, (R_cw, t_cw)) in enumerate(zip(rig.cameras, rig.camera_poses(), strict=True)):
-        arm = centres @ np.swapaxes(R[i], 1, 2)
-        view, d_point, _ = project_with_jacobians((arm + t[i][:, None]) @ R_cw.T + t_cw, camera)
+    R, t = np.broadcast_to(R, (2, *R.shape[-3:])), np.broadcast_to(t, (2, *t.shape[-2:]))
+    for of, to, camera, (R_cw, t_cw) in zip(R, t, rig.cameras, rig.camera_poses(), strict=True):
+        arm = centres_body @ np.swapaxes(of, 1, 2)
+        view, d_point, _ = project_with_jacobians((arm + to[:, None]) @ R_cw.T + t_cw, camera)
         d_world = d_point @ R_cw
         pixels.append(view)
-        by_pose.append(np.concatenate([d_world, np.cross(arm[..., None, :], d_world)], axis=-1))
+        by_pose.append(np.concatenate([d_world, by_turning(d_world, arm)], axis=-1))
     return np.stack(pixels, axis=1), np.stack(by_pose, axis=1)
+
+
+def predict(R: Array, t: Array, rig: StereoRig, disc: Disc, faults: Faults) -> tuple[Array, Array]:
+    """As `marker_pixels`, with faults; those of clocks and images are not included."""
+    return marker_pixels(R, t, cameras_with(faults, rig), centres_with(faults, disc))
 
 
 def ellipse_centre_shift(R: Array, t: Array, rig: StereoRig, disc: Disc) -> Array:

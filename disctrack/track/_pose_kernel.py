@@ -113,7 +113,7 @@ def fit_pose(observed, covariance, used, cameras, centres, tolerance, reach, R, 
     sums, trial_sums, damped, step = np.empty((7, 6)), np.empty((7, 6)), np.empty((6, 6)), np.zeros(6)
     R_trial, t_trial = np.empty((3, 3)), np.empty(3)
     cost, damping, solved, small = np.inf, 1e-7, True, False
-    for k in range(_MAX_ITERATIONS + 1 if tolerance >= 0.0 else 1):
+    for k in range(_MAX_ITERATIONS + 1):
         _rotate_from_left(step[3:6], R, R_trial)
         for i in range(3):
             t_trial[i] = t[i] + step[i]
@@ -150,7 +150,7 @@ def fit(rows, observed, covariance, used, cameras, centres, tolerance, R, t, con
 
     observed (n, 2, m, 2), covariance (n, 2, m, 2, 2), used (n, 2, m); cameras as from `pose.stacked`. Marquardt 1963,
     with Nielsen-like damping. A pose has converged when its Gauss-Newton step is shorter than `tolerance` standard
-    deviations of its parameters, sqrt(step^T J^T J step); with a negative tolerance the model is only evaluated.
+    deviations of its parameters, sqrt(step^T J^T J step).
     Filled: converged (n,), and for the last pose tried (the solution if converged) pixels (n, 2, m, 2) of all dots, NaN
     behind a camera; residuals (n, 2, m, 2), observed - pixels, and jacobian (n, 2, m, 2, 6), both whitened, with zeros
     for dots that are not used.

@@ -15,6 +15,7 @@ from calibration.cameras.camera import N_RIG, StereoRig, by_turning
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.least_squares import normal_of_rows
 from disctrack.disc import Disc
+from disctrack.faults.dots import marker_pixels
 from disctrack.track import _pose_kernel as kernel
 
 MIN_DOTS = 3  # six unknowns, two coordinates per dot
@@ -107,19 +108,6 @@ class DotsInFrames:
         rows = np.where((used & np.isfinite(rows).all(axis=(-2, -1)))[..., None, None], rows, 0.0)
         square = normal_of_rows(rows.reshape(len(rows), -1, rows.shape[-1]), 6).eliminated()
         return square[:-1, :-1], square[:-1, -1], float(square[-1, -1])
-
-
-def marker_pixels(R: Array, t: Array, rig: StereoRig, centres_body: Array) -> tuple[Array, Array]:
-    """Images of the dots' centres (n, 2, m, 2) and their derivative (n, 2, m, 2, 6) by POSE_COMPONENTS.
-
-    R (n, 3, 3), t (n, 3): body -> world; centres_body (m, 3). NaN behind a camera.
-    """
-    shape, rows = (len(R), 2, len(centres_body)), np.arange(len(R))
-    seen = np.zeros((*shape, 2)), np.tile(np.eye(2), (*shape, 1, 1)), np.ones(shape, bool)
-    filled = pixels, _, J = np.empty((*shape, 2)), np.empty((*shape, 2)), np.empty((*shape, 2, 6))
-    poses = np.array(R, float), np.array(t, float), np.empty(len(R), bool)
-    kernel.fit(rows, *seen, stacked(rig), np.ascontiguousarray(centres_body, float), -1.0, *poses, filled)
-    return pixels, J
 
 
 def dots_at(R: Array, t: Array, rig: StereoRig, disc: Disc) -> tuple[Array, Array]:

@@ -87,23 +87,29 @@ _EXP = tuple(
 
 
 @_part
-def _plane_gradient(map_x, map_y, P, iu, iv, unit, G):
-    """Derivatives of the exact map at the pixel (iu, iv) by central differences; returns the determinant.
+def _view_of(camera, point, R, unit, P, G, J):
+    """Image u, v of a dot's centre, and derivatives there; returns also the determinant of d plane point / d pixel.
 
-    G (3, 2): rows 0 and 1 are d plane point / d pixel, in units; row 2 is the relative change per 10 px of the length
-    that a pixel spans along the direction moved: -2 d log w, w the denominator of the projective map.
+    point (3,): the centre, and R (3, 3): body axes, in camera axes; unit: radius of the dot, the unit of lengths on the
+    plane. P (3, 3) receives the homography from the normalised image to the plane, whose origin is the centre [m].
+    G (5, 2): rows 0 and 1 are d plane point / d pixel, rows 3 and 4 their inverse; row 2 is the relative change, per
+    10 px moved, of the squared number of pixels that a length spans. J (2, 3) is scratch.
     """
-    w = P[2, 0] * map_x[iv, iu] + P[2, 1] * map_y[iv, iu] + P[2, 2]
+    for k in range(3):  # inverse of (e1, e2, point) by cofactors, up to a factor
+        i, j = (k + 1) % 3, (k + 2) % 3
+        P[0, k] = R[i, 1] * point[j] - R[j, 1] * point[i]
+        P[1, k] = R[j, 0] * point[i] - R[i, 0] * point[j]
+        P[2, k] = R[i, 0] * R[j, 1] - R[j, 0] * R[i, 1]
+    deeper_x, deeper_y = unit * R[2, 0] / point[2], unit * R[2, 1] / point[2]  # relative change of the depth
+    u, v = project_point(camera, point[0], point[1], point[2], J)
+    for i in range(2):
+        for k in range(2):
+            G[3 + i, k] = unit * (J[i, 0] * R[0, k] + J[i, 1] * R[1, k] + J[i, 2] * R[2, k])
+    det = 1.0 / (G[3, 0] * G[4, 1] - G[3, 1] * G[4, 0])
+    G[0, 0], G[0, 1], G[1, 0], G[1, 1] = det * G[4, 1], -det * G[3, 1], -det * G[4, 0], det * G[3, 0]
     for axis in range(2):
-        u, v = (iu + 1, iv) if axis == 0 else (iu, iv + 1)
-        x1, y1 = map_x[v, u], map_y[v, u]
-        x0, y0 = map_x[2 * iv - v, 2 * iu - u], map_y[2 * iv - v, 2 * iu - u]
-        w1, w0 = P[2, 0] * x1 + P[2, 1] * y1 + P[2, 2], P[2, 0] * x0 + P[2, 1] * y0 + P[2, 2]
-        for i in range(2):
-            first, last = P[i, 0] * x0 + P[i, 1] * y0 + P[i, 2], P[i, 0] * x1 + P[i, 1] * y1 + P[i, 2]
-            G[i, axis] = 0.5 / unit * (last / w1 - first / w0)
-        G[2, axis] = 10.0 * (w1 - w0) / w
-    return G[0, 0] * G[1, 1] - G[0, 1] * G[1, 0]
+        G[2, axis] = -20.0 * (deeper_x * G[0, axis] + deeper_y * G[1, axis])
+    return u, v, det
 
 
 @_part
@@ -147,16 +153,16 @@ def _edge_profile(z):
 
 
 @_part
-def _select_pixels(image, map_x, map_y, P, start, window, rim, centres, own, G, steepest, p, u0, v0, pixels):
+def _select_pixels(image, map_x, map_y, P, face, own, window, G, steepest, p, u0, v0, pixels):
     """Select the pixels in a band around the edge; returns their number and the mean grey value inside and outside.
 
     steepest: largest length of a pixel on the plane, in radii of the dot.
     """
-    (x_lo, x_hi, y_lo, y_hi), unit = window, start[2]
+    (x_lo, x_hi, y_lo, y_hi), (centres, unit, rim) = window, face
+    expected_x, expected_y = centres[own, 0], centres[own, 1]
     band = 3.0 * p[ROW.sigma] + 1.0
-    shift_x, shift_y, radius = _f(p[ROW.a]), _f(p[ROW.b]), _f(p[ROW.radius])
+    radius = _f(p[ROW.radius])
     outer = p[ROW.radius] + band * steepest
-    x_from, y_from = start[0] / unit, start[1] / unit
     X0, X1, X2, Y0, Y1, Y2 = P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2]
     w0, w1, w2 = unit * P[2, 0], unit * P[2, 1], unit * P[2, 2]
     width = x_hi + 1 - x_lo
@@ -169,32 +175,30 @@ def _select_pixels(image, map_x, map_y, P, start, window, rim, centres, own, G, 
         x_row, y_row = pixels[2, first:], pixels[3, first:]
         for k in range(width):
             w = 1.0 / (w0 * xs[k] + w1 * ys[k] + w2)
-            X_row[k] = (X0 * xs[k] + X1 * ys[k] + X2) * w - x_from
-            Y_row[k] = (Y0 * xs[k] + Y1 * ys[k] + Y2) * w - y_from
+            X_row[k] = (X0 * xs[k] + X1 * ys[k] + X2) * w
+            Y_row[k] = (Y0 * xs[k] + Y1 * ys[k] + Y2) * w
             x_row[k], y_row[k], grey_row[k] = 0.1 * (x_lo + k - u0), 0.1 * (y - v0), greys[k]
     # is the rim or another dot near enough to affect any pixel?
-    reach = unit * (outer + math.hypot(p[ROW.a], p[ROW.b]))
+    reach = unit * outer
     blur = p[ROW.sigma] * steepest * unit
-    crowded = math.hypot(start[0], start[1]) + reach > rim - 2.5 * blur
+    crowded = math.hypot(expected_x, expected_y) + reach > rim - 2.5 * blur
     for j in range(centres.shape[0]):
-        apart = math.hypot(start[0] - centres[j, 0], start[1] - centres[j, 1])
-        crowded |= j != own and apart - reach - start[2] < 3.0 * blur
+        apart = math.hypot(expected_x - centres[j, 0], expected_y - centres[j, 1])
+        crowded |= j != own and apart - reach - unit < 3.0 * blur
     g00, g01, g10, g11 = _f(G[0, 0]), _f(G[0, 1]), _f(G[1, 0]), _f(G[1, 1])
     for i in range(n):
-        d, slope, nx, ny, inv_g, curvature = _edge_distance(
-            pixels[0, i] - shift_x, pixels[1, i] - shift_y, radius, g00, g01, g10, g11, _0
-        )
+        d, slope, nx, ny, inv_g, curvature = _edge_distance(pixels[0, i], pixels[1, i], radius, g00, g01, g10, g11, _0)
         pixels[5, i], pixels[6, i] = d, inv_g
     kept, nearest, farthest = 0, _f(-band - 1.0), _f(band)
     for i in range(n):
         d = pixels[5, i]
         good = nearest < d < farthest  # False also for NaN: a pixel without a ray
         if crowded and good:
-            X, Y = start[0] + unit * pixels[0, i], start[1] + unit * pixels[1, i]
+            X, Y = expected_x + unit * pixels[0, i], expected_y + unit * pixels[1, i]
             blur = p[ROW.sigma] * unit / pixels[6, i]
             good = math.hypot(X, Y) <= rim - 2.5 * blur
             for j in range(centres.shape[0]):
-                good &= j == own or math.hypot(X - centres[j, 0], Y - centres[j, 1]) - start[2] >= 3.0 * blur
+                good &= j == own or math.hypot(X - centres[j, 0], Y - centres[j, 1]) - unit >= 3.0 * blur
         for row in range(6):
             pixels[ROW.x + row, kept] = pixels[row, i]
         kept += 1 if good else 0
@@ -296,7 +300,7 @@ def _whitened_ellipse(pixels, n, p, G, det, centroid, nodes, clip):
     Along the long axis x = a sin t, for which the trapezoidal rule converges exponentially; across it the error
     function.
     """
-    i00, i01, i10, i11 = G[1, 1] / det, -G[0, 1] / det, -G[1, 0] / det, G[0, 0] / det  # plane -> pixel
+    i00, i01, i10, i11 = G[3, 0], G[3, 1], G[4, 0], G[4, 1]  # plane -> pixel
     c00, c01, c11 = i00 * i00 + i01 * i01, i00 * i10 + i01 * i11, i10 * i10 + i11 * i11
     half_difference = 0.5 * (c00 - c11)
     angle = 0.5 * math.atan2(c01, half_difference)
@@ -413,29 +417,25 @@ def _descend(pixels, n, p, G, det, px_per_unit, clip, work, blurred, centroid, n
 
 
 @_part
-def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pixels, work, p, result):
+def _fit_dot(image, map_x, map_y, camera, point, R, face, own, sigma, noise, pixels, work, result):
     """Fit the image of one circular dot to the grey values around its edge. Returns a MarkerStatus code.
 
-    image (H, W); map_x, map_y (H, W): normalised coordinates of every pixel; P (3, 3): normalised image -> target
-    plane; start (7,): expected centre and radius on the plane, pixel of that centre, and of the centroid of the dot's
-    image; sigma: initial guess of the blur [px]; noise (3,): variance = noise[0] + noise[1] grey, and the grey-value
-    step; rim: radius of the face on the plane; centres (m, 3) of all dots, `own` the index of this one: pixels that the
-    blur of the rim or of another dot reaches are not used; pixels and work (matrix, right-hand side, step) are scratch.
-    p (8,) receives the template's parameters (a, b: shift on the plane from the expected centre), result (a DOT) the
-    quality of the fit and the centre's covariance in pixels. The caller projects the centre (u, v).
+    image (H, W); map_x, map_y (H, W): normalised coordinates of every pixel; point (3,): expected centre, and R (3, 3):
+    body axes, in axes of the camera; face as from `template.face_of`, in which the dot is number `own`: pixels that the
+    blur of the rim or of another dot reaches are not used; sigma: initial guess of the blur [px]; noise (3,): variance
+    = noise[0] + noise[1] grey, and the grey-value step; pixels and work (matrix, right-hand side, step) are scratch.
+    result (a DOT) receives the centre with its covariance in pixels, and the quality of the fit.
     """
     height, width = image.shape
-    G = np.empty((3, 2))
-    nodes = np.empty((3, _NODES), np.float32)
-    u0, v0, unit = start[3], start[4], start[2]  # lengths on the plane are in radii of the dot
-    for i in range(8):
-        p[i] = 0.0
+    unit = face[1]  # lengths on the plane are in radii of the dot
+    P, G, J, nodes = np.empty((3, 3)), np.empty((5, 2)), np.empty((2, 3)), np.empty((3, _NODES), np.float32)
+    p = np.zeros(8)
     p[ROW.radius], p[ROW.sigma] = 1.0, sigma
-    n, n_clipped, det, chi2, largest, light, settled = 0, 0.0, 0.0, 0.0, 0.0, 1.0, False
+    n, n_clipped, chi2, light, settled = 0, 0.0, 0.0, 1.0, False
     for selection in range(_MAX_ITERATIONS):
+        u0, v0, det = _view_of(camera, point, R, unit, P, G, J)
         if not (2.0 < u0 < width - 3.0 and 2.0 < v0 < height - 3.0):
             return OUTSIDE
-        det = _plane_gradient(map_x, map_y, P, int(u0 + 0.5), int(v0 + 0.5), unit, G)
         norm2 = G[0, 0] * G[0, 0] + G[0, 1] * G[0, 1] + G[1, 0] * G[1, 0] + G[1, 1] * G[1, 1]
         largest = math.sqrt(0.5 * (norm2 + math.sqrt(max(norm2 * norm2 - 4 * det * det, 0.0))))
         if not abs(det) > 1e-9 * norm2:
@@ -445,8 +445,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
             return BLURRED
         blurred = 1.0 / largest < _MIN_SEMI_MINOR * blur
         band = 3.0 * p[ROW.sigma] + 1.0
-        extent_x = math.hypot(G[0, 1], G[1, 1]) / abs(det) + band
-        extent_y = math.hypot(G[0, 0], G[1, 0]) / abs(det) + band
+        extent_x, extent_y = math.hypot(G[3, 0], G[3, 1]) + band, math.hypot(G[4, 0], G[4, 1]) + band
         window = (
             int(math.floor(u0 - extent_x)),
             int(math.ceil(u0 + extent_x)),
@@ -458,9 +457,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
         room = (window[1] - window[0] + 1) * (window[3] - window[2] + 1) + 1
         if room > pixels.shape[1]:
             pixels = np.empty((16, room), np.float32)
-        n, inside, outside = _select_pixels(
-            image, map_x, map_y, P, start, window, rim, centres, own, G, largest, p, u0, v0, pixels
-        )
+        n, inside, outside = _select_pixels(image, map_x, map_y, P, face, own, window, G, largest, p, u0, v0, pixels)
         if not (n >= 30 and math.isfinite(inside) and math.isfinite(outside)):
             return OCCLUDED
         if selection == 0:
@@ -480,9 +477,10 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
             weight[i] = _1 / math.sqrt(max(read_32 + gain_32 * (level + step * s), floor))
         for i in range(n):
             grey[i] *= in_light  # a product in double precision, rounded once
+        u, v = _image_centroid(camera, point, R, unit, J)
+        centroid = u - u0, v - v0
         limit = np.inf
         while True:  # once with all pixels, once without outliers
-            centroid = start[5] - u0, start[6] - v0
             converged, chi2, n_clipped = _descend(
                 pixels, n, p, G, det, largest / abs(det), limit, work, blurred, centroid, nodes
             )
@@ -491,10 +489,8 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
             if limit < np.inf:
                 chi2 -= n_clipped * limit
                 break
-            moved_u = start[3] + (G[1, 1] * p[ROW.a] - G[0, 1] * p[ROW.b]) / det - u0
-            moved_v = start[4] + (G[0, 0] * p[ROW.b] - G[1, 0] * p[ROW.a]) / det - v0
-            u0, v0 = u0 + moved_u, v0 + moved_v
-            settled = math.hypot(moved_u, moved_v) < _SETTLED_PX
+            a, b = p[ROW.a], p[ROW.b]
+            settled = math.hypot(G[3, 0] * a + G[3, 1] * b, G[4, 0] * a + G[4, 1] * b) < _SETTLED_PX
             if not blurred and 1.0 / largest < _MIN_SEMI_MINOR * p[ROW.sigma]:
                 settled = False  # more blurred than expected: fit the ellipse instead
             if not settled and selection < _MAX_ITERATIONS - 1:
@@ -506,6 +502,9 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
                 worst = max(worst, abs(pixels[ROW.residual, i]))
             if worst * worst <= limit:
                 break
+        for k in range(3):
+            point[k] += unit * (R[k, 0] * p[ROW.a] + R[k, 1] * p[ROW.b])
+        p[ROW.a], p[ROW.b] = 0.0, 0.0  # from here on
         if settled:
             break
     # covariance of the shift on the plane: the leading corner of (J^T W J)^-1
@@ -514,11 +513,11 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
         x[i], y[i] = 1.0 if i == ROW.a else 0.0, 1.0 if i == ROW.b else 0.0
     substitute(M, x)
     substitute(M, y)
-    a, b, c, d = G[1, 1] / det, -G[0, 1] / det, -G[1, 0] / det, G[0, 0] / det
+    a, b, c, d = G[3, 0], G[3, 1], G[4, 0], G[4, 1]
     result.var_u = a * a * x[ROW.a] + 2 * a * b * x[ROW.b] + b * b * y[ROW.b]
     result.var_v = c * c * x[ROW.a] + 2 * c * d * x[ROW.b] + d * d * y[ROW.b]
     result.cov_uv = a * c * x[ROW.a] + (a * d + b * c) * x[ROW.b] + b * d * y[ROW.b]
-    p[ROW.a], p[ROW.b], p[ROW.radius] = unit * p[ROW.a], unit * p[ROW.b], unit * p[ROW.radius]
+    result.u, result.v = project_point(camera, point[0], point[1], point[2], J)
     freedom, inside, n_inside = max(n - n_clipped - 8, 1), 0.0, 0.0
     for i in range(n):
         within = _1 if pixels[ROW.distance, i] < _0 else _0
@@ -527,7 +526,7 @@ def _fit_dot(image, map_x, map_y, P, start, sigma, noise, rim, centres, own, pix
     result.chi_square = chi2 / freedom
     result.inside = inside / max(n_inside, 1.0) * n / freedom
     result.outside = (chi2 - inside) / max(n - n_inside, 1.0) * n / freedom
-    result.sigma, result.radius = p[ROW.sigma], p[ROW.radius]
+    result.sigma, result.radius = p[ROW.sigma], unit * p[ROW.radius]
     result.level, result.contrast = light * p[ROW.level], p[ROW.contrast]
     result.clipped, result.n_pixels = n_clipped / n, n
     return MEASURED
@@ -560,61 +559,45 @@ def _look(images, readable, maps, cameras, face, sigma, noise, limits, R, t, pix
     Filled: results (cameras, m) of DOT, status (cameras, m); u, v are the image of the dot's centre, not the centre of
     its elliptical image.
     """
-    (centres, radius, rim), (intrinsics, R_cw, t_cw) = face, cameras
-    m = centres.shape[0]
-    R_cb, P, M = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    point, start, p, J = np.empty(3), np.empty(7), np.empty(8), np.empty((2, 3))
+    centres, (intrinsics, R_cw, t_cw) = face[0], cameras
+    R_cb, point = np.empty((3, 3)), np.empty(3)
     for c in range(images.shape[0]):
         for i in range(3):
             for j in range(3):
                 R_cb[i, j] = R_cw[c, i, 0] * R[0, j] + R_cw[c, i, 1] * R[1, j] + R_cw[c, i, 2] * R[2, j]
-        for i in range(m):
-            result = results[c, i]
-            if not readable[c]:
-                status[c, i] = NOT_LOOKED_FOR
-                continue
-            x, y, z = centres[i, 0], centres[i, 1], centres[i, 2]
+        for i in range(centres.shape[0]):
             facing = 0.0
             for k in range(3):
-                shift = t_cw[c, k] + R_cw[c, k, 0] * t[0] + R_cw[c, k, 1] * t[1] + R_cw[c, k, 2] * t[2]
-                M[k, 0], M[k, 1], M[k, 2] = R_cb[k, 0], R_cb[k, 1], R_cb[k, 2] * z + shift
-                point[k] = M[k, 0] * x + M[k, 1] * y + M[k, 2]
-                facing -= R_cb[k, 2] * point[k]
-            if point[2] <= 0.0:
-                status[c, i] = OUTSIDE
-                continue
-            if facing <= 0.0:  # the camera sees the other face
-                status[c, i] = OCCLUDED
-                continue
-            for k in range(3):  # P = M^-1 by cofactors, up to a factor, which does not matter for a homography
+                point[k] = t_cw[c, k]
                 for j in range(3):
-                    a, b, d, e = (j + 1) % 3, (j + 2) % 3, (k + 1) % 3, (k + 2) % 3
-                    P[k, j] = M[a, d] * M[b, e] - M[a, e] * M[b, d]
-            start[0], start[1], start[2] = x, y, radius
-            start[3], start[4] = project_point(intrinsics[c], point[0], point[1], point[2], J)
-            start[5], start[6] = _image_centroid(intrinsics[c], point, R_cb, radius, J)
-            status[c, i] = _fit_dot(images[c], maps[0][c], maps[1][c], P, start, sigma[c],
-                                    noise[c], rim, centres, i, pixels, work, p, result)  # fmt: skip
+                    point[k] += R_cw[c, k, j] * t[j] + R_cb[k, j] * centres[i, j]
+                facing -= R_cb[k, 2] * point[k]
+            if not readable[c]:
+                status[c, i] = NOT_LOOKED_FOR
+            elif point[2] <= 0.0:
+                status[c, i] = OUTSIDE
+            elif facing <= 0.0:  # the camera sees the other face
+                status[c, i] = OCCLUDED
+            else:
+                status[c, i] = _fit_dot(images[c], maps[0][c], maps[1][c], intrinsics[c], point, R_cb, face, i,
+                                        sigma[c], noise[c], pixels, work, results[c, i])  # fmt: skip
             if status[c, i] == MEASURED:
-                for k in range(3):
-                    point[k] += R_cb[k, 0] * p[ROW.a] + R_cb[k, 1] * p[ROW.b]
-                result.u, result.v = project_point(intrinsics[c], point[0], point[1], point[2], J)
-                status[c, i] = _judge_dot(result, radius, sigma[c], noise[c], limits)
+                status[c, i] = _judge_dot(results[c, i], face[1], sigma[c], noise[c], limits)
 
 
 @_part
-def _predict(last, before, older, t_last, t_before, t_older, R, t):
-    """Extrapolate the pose with constant second differences: rotation D1 D0^T D1 after D0 and D1.
+def _predict(R, t):
+    """Extrapolate poses R (4, 3, 3), t (4, 3) with constant second differences: D1 D0^T D1 after rotations D0 and D1.
 
     The error is the third difference of the motion. An extrapolation with constant velocity would err in proportion to
     the acceleration, and bias the centres with it (by the template's band and shape), by 1e-4 px.
     """
     for i in range(3):
-        t[i] = 3.0 * (t_last[i] - t_before[i]) + t_older[i]
-    _copy(R, last)
-    _turn_on(last, before, R)
-    _turn_on(older, before, R)
-    _turn_on(last, before, R)
+        t[3, i] = 3.0 * (t[2, i] - t[1, i]) + t[0, i]
+    _copy(R[3], R[2])
+    _turn_on(R[2], R[1], R[3])
+    _turn_on(R[0], R[1], R[3])
+    _turn_on(R[2], R[1], R[3])
 
 
 @_part
@@ -666,42 +649,35 @@ def _settle(results, status, cameras, centres, R, t, dots, filled):
 
 
 @_entry
-def track_frames(images, readable, maps, cameras, face, sigma, noise, limits, heading, results, status, R_out, t_out,
-                 max_rms):  # fmt: skip
+def track_frames(images, readable, maps, cameras, face, sigma, noise, limits, results, status, R, t, max_rms):
     """Follow the disc through a block of pairs, each predicted from the three before (`_predict`).
 
     images (n, 2, H, W); readable (n, 2); maps: x and y (2, H, W) undistorted normalised coordinates of the cameras'
     pixels; cameras as from `pose.stacked`, face as from `template.face_of`; sigma (2,) [px] of the dots' edges in each
-    camera; noise (2, 3): variance = noise[0] + noise[1] grey, and the grey-value step; heading: the last three poses
-    ((R, t), ...), which are updated. Filled: results (n, 2, m) of DOT, status (n, 2, m), R_out (n, 3, 3), t_out (n, 3).
+    camera; noise (2, 3): variance = noise[0] + noise[1] grey, and the grey-value step. Filled: results (n, 2, m) of
+    DOT, status (n, 2, m); R (3 + n, 3, 3), t (3 + n, 3) after the three poses before.
     Returns the number of frames followed; less than n if the disc was lost at that frame.
     """
-    (R_last, t_last), (R_before, t_before), (R_older, t_older) = heading
     pixels, work = np.empty((16, _PIXELS), np.float32), (np.empty((8, 8)), np.empty(8), np.empty(8))
-    R, t, R_expected, shape = np.empty((3, 3)), np.empty(3), np.empty((3, 3)), (2, face[0].shape[0])
+    R_expected, shape = np.empty((3, 3)), (2, face[0].shape[0])
     dots = np.empty((*shape, 2)), np.zeros((*shape, 2, 2)), np.empty(shape, np.bool_)
     filled = np.empty((*shape, 2)), np.empty((*shape, 2)), np.empty((*shape, 2, 6))
     for f in range(images.shape[0]):
-        _predict(R_last, R_before, R_older, t_last, t_before, t_older, R, t)
+        _predict(R[f : f + 4], t[f : f + 4])
+        pose = R[f + 3], t[f + 3]
         rms = -1.0
         for _ in range(3):
-            _copy(R_expected, R)
-            _look(images[f], readable[f], maps, cameras, face, sigma, noise, limits, R, t, pixels, work, results[f],
+            _copy(R_expected, pose[0])
+            _look(images[f], readable[f], maps, cameras, face, sigma, noise, limits, *pose, pixels, work, results[f],
                   status[f])  # fmt: skip
-            rms = _settle(results[f], status[f], cameras, face[0], R, t, dots, filled)
+            rms = _settle(results[f], status[f], cameras, face[0], *pose, dots, filled)
             turned = 0.0
             for i in range(3):
                 for j in range(3):
-                    turned += (R[i, j] - R_expected[i, j]) * (R[i, j] - R_expected[i, j])
+                    turned += (pose[0][i, j] - R_expected[i, j]) * (pose[0][i, j] - R_expected[i, j])
             if rms < 0.0 or turned < 2.0 * _ATTITUDE_TOLERANCE * _ATTITUDE_TOLERANCE:
                 break
         if not 0.0 <= rms < max_rms:
             return f
-        _orthonormalise(R, R_expected)
-        _copy(R_older, R_before)
-        _copy(R_before, R_last)
-        _copy(R_last, R)
-        _copy(R_out[f], R)
-        for i in range(3):
-            t_older[i], t_before[i], t_last[i], t_out[f, i] = t_before[i], t_last[i], t[i], t[i]
+        _orthonormalise(pose[0], R_expected)
     return images.shape[0]

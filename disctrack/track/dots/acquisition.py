@@ -17,8 +17,9 @@ from calibration.kit.arrays import Array
 from calibration.kit.grey_levels import level_step
 from disctrack.analyse.declaration import SIDE_TOLERANCE
 from disctrack.disc import Disc
+from disctrack.faults.dots import marker_pixels
 from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_vector
-from disctrack.track.pose import DotsInFrames, fit_poses, marker_pixels
+from disctrack.track.pose import DotsInFrames, fit_poses
 
 MAX_BLOBS = 24
 EPIPOLAR_PX = 4.0  # centroids of blobs err by up to 1 px under glare, the rig by much less

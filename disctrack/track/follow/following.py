@@ -36,21 +36,21 @@ REPEAT_REACH = 4  # preceding frames with which an image is compared: recorders 
 
 
 class Heading(NamedTuple):
-    """The last three poses, from which the next is predicted (`_kernels.track_frames`)."""
+    """The last three poses, the latest last, from which the next is predicted (`_kernels.track_frames`)."""
 
-    last: Pose
-    before: Pose
-    older: Pose
+    R: Array  # (3, 3, 3)
+    t: Array  # (3, 3) [m]
 
     @classmethod
     def steady(cls, last: Pose, before: Pose) -> Heading:
         """Heading of constant velocity: the turn and shift between these poses are repeated."""
         turn = last[0] @ before[0].T
-        return cls(last, before, (turn.T @ before[0], 2 * before[1] - last[1]))
+        R, t = np.stack([turn.T @ before[0], before[0], last[0]]), [2 * before[1] - last[1], before[1], last[1]]
+        return cls(R, np.stack(t))
 
     def carried_on(self, steps: int) -> Heading:
         """Heading after so many more frames with constant velocity."""
-        (R_last, t_last), (R_before, t_before) = self.last, self.before
+        (R_before, R_last), (t_before, t_last) = self.R[1:], self.t[1:]
         turn = rotation_from_vector(steps * vector_from_rotation(R_last @ R_before.T))
         shift = steps * (t_last - t_before)
         return Heading.steady((turn @ R_last, t_last + shift), (turn @ R_before, t_before + shift))
@@ -110,12 +110,12 @@ def run(
     limits : beyond which a dot is refused
     returns : number of frames until the disc was lost, and the heading there
     """
-    known = Heading(*((np.array(R, order="C"), np.array(t)) for R, t in heading))  # copies: the loop updates them
     blur, noise = np.array([edge.blur_px for edge in follower.edges]), np.array([edge.noise for edge in follower.edges])
     fixed = follower.maps, stacked(follower.rig), face_of(follower.disc), blur, noise, limits
-    filled = rows.results, rows.status, rows.R, rows.t
-    done = kernels.track_frames(images, readable, *fixed, known, *filled, MAX_PREDICTION_RMS_PX)
-    return int(done), known
+    R, t = (np.concatenate([before, after]) for before, after in zip(heading, (rows.R, rows.t), strict=True))
+    done = int(kernels.track_frames(images, readable, *fixed, rows.results, rows.status, R, t, MAX_PREDICTION_RMS_PX))
+    rows.R[:done], rows.t[:done] = R[3 : 3 + done], t[3 : 3 + done]
+    return done, Heading(R[done : done + 3], t[done : done + 3])
 
 
 def empty_tables(n: int, m: int) -> Tables:
@@ -249,7 +249,7 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
     follower.first_reason = follower.first_reason or reason
     if pose is None:
         return False
-    before = pose if follower.heading is None or follower.lost != 0 else follower.heading.last
+    before = pose if follower.heading is None or follower.lost != 0 else (follower.heading.R[2], follower.heading.t[2])
     heading = Heading.steady(_nearest_alike(before, pose, follower.disc), before).carried_on(-1)
     if not follower.measured:
         _measure_blur_and_noise(follower, images, readable, heading)

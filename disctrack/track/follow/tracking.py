@@ -24,7 +24,7 @@ from disctrack.track.follow.following import Follower, Heading, Tables, empty_ta
 from disctrack.track.judge.cameras import frames_ahead, left_out
 from disctrack.track.judge.disc_not_seen import MEETING_PX, why_not_seen
 from disctrack.track.judge.doubts import MOVED
-from disctrack.track.pose import marker_pixels
+from disctrack.track.pose import DotsInFrames, fit_poses
 from disctrack.track.refine.assembly import Measurement, Taken, TrackingSettings, assemble
 from disctrack.track.side_by_side import evenly, stretches
 from disctrack.trajectory import FrameStatus, MarkerStatus
@@ -46,9 +46,10 @@ def prepare(dtype: DTypeLike = np.uint8) -> None:
     """Compile the inner loops for images of this type, or load them: some seconds once per installation."""
     camera, still = Camera(1.0, 1.0, 0.0, 0.0, (0.0,) * 5, (8, 8)), (np.eye(3), np.zeros(3))
     rig = StereoRig(camera, camera, *still, *still)
-    rows, nothing = empty_tables(0, MA_2014.n_markers), np.zeros((0, 2, 8, 8), dtype)
-    run(Follower(rig, MA_2014, maps_of(rig)), Heading(still, still, still), nothing, np.zeros((0, 2), bool), rows)
-    marker_pixels(rows.R, rows.t, rig, MA_2014.marker_centres_body)
+    rows, nothing, m = empty_tables(0, MA_2014.n_markers), np.zeros((0, 2, 8, 8), dtype), MA_2014.n_markers
+    run(Follower(rig, MA_2014, maps_of(rig)), Heading.steady(still, still), nothing, np.zeros((0, 2), bool), rows)
+    unseen = np.full((1, 2, m, 2), np.nan), np.zeros((1, 2, m, 2, 2)), np.eye(3)[None], np.zeros((1, 3))
+    fit_poses(DotsInFrames(rig, MA_2014, *unseen), with_sensitivity=False)
 
 
 def track(

@@ -7,10 +7,10 @@ import pytest
 
 from disctrack import frames
 from disctrack.disc import MA_2014, disc_from_mm, has_mirror_axis, symmetry_order
+from disctrack.faults.dots import marker_pixels
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.dots.acquisition import acquire, acquire_from_blobs, dot_blobs
-from disctrack.track.pose import marker_pixels
 
 
 def assert_found(answer, R, t, shift, turn_deg):

@@ -7,9 +7,10 @@ from scipy.optimize import least_squares
 
 from disctrack import frames
 from disctrack.disc import MA_2014
+from disctrack.faults.dots import marker_pixels
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
-from disctrack.track.pose import DotsInFrames, PoseFits, fit_poses, marker_pixels
+from disctrack.track.pose import DotsInFrames, PoseFits, fit_poses
 from disctrack.track.refine.scatter import scatter_of_poses
 
 SIGMA_PX = 0.01
