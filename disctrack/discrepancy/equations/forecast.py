@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.kit.arrays import Array
+from disctrack.discrepancy.elimination import prior_rows
 from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations.declared import Samples
 from disctrack.discrepancy.equations.system import EquationSystem
@@ -60,7 +61,12 @@ def free_run(system: EquationSystem, fitted: Fit, samples: Samples, left: Array,
         ]
         start = fit(begin, loose, values | begun)
         values, spread = values | start.values, start.covariance
-        J = begin.linearise(values, [*by_state, *numbers])[1].reshape(-1, len(by_state) + len(numbers))
+        residual, J = begin.linearise(values, [*by_state, *numbers])
+        J = J.reshape(-1, J.shape[-1])
+        # one more step: with a wide band the fit stops before the minimum
+        prior, by_prior = prior_rows(loose, values)
+        step = spread @ (J[:, : len(by_state)].T @ residual.ravel() + by_prior.T @ prior)
+        values |= {name: values[name] + float(d) for name, d in zip(by_state, step, strict=True)}
         # with other numbers the fit of the initial state is another
         follows = -spread @ J[:, : len(by_state)].T @ J[:, len(by_state) :]
     found = alone.predict(values, alone.stretches[0], [*by_state, *numbers])
