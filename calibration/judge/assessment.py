@@ -81,7 +81,7 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
         float(np.trace(np.linalg.solve(at_minimum, expected))), 1e-12
     )  # noise moves fewer than s1 directions
     # its weight was multiplied by the disagreement of the views
-    extra = (problem.prior.weight - 1.0) * refinement.normal.prior[:-1, :-1] * scale[:, None] * scale
+    extra = max(problem.prior.weight - 1.0, 0.0) * refinement.normal.prior[:-1, :-1] * scale[:, None] * scale
     by_prior = inverse.T @ extra @ inverse
     result: Array = (at_minimum + share * beyond @ beyond.T + by_prior) * scale[:s1, None] * scale[:s1]
     return result
