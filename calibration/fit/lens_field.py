@@ -1,10 +1,10 @@
 """Fit of the lens field, a smooth displacement of the image beyond the distortion polynomial, to views of the board.
 
 The coefficients of the splines (`splines`) have a normal prior. Cameras, poses and the board's shape are refined with
-them, with the priors that they have without a field. It is the sum of a field that is smooth
-over two cells of its grid, and of a smaller one that varies within a cell. The sizes of both maximise the marginal
-likelihood of all views (MacKay 1992), not the held-out error: a held-out view at the edge of the image covers an area
-that no other view covers. The field is kept if it reduces the held-out error.
+them, with the priors that they have without a field. It is the sum of a field that is smooth over two cells of its
+grid, and of a smaller one that varies within a cell. The sizes of both maximise the marginal likelihood of all views
+(MacKay 1992), not the held-out error: a held-out view at the edge of the image covers an area that no other view
+covers. The field is kept if it reduces the held-out error.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ class Problem:
             columns = [d_pose, d_stereo, d_point @ self.shape_basis[o.point], residual[..., None]]
             columns[3:3] = [] if beyond is None else [beyond]
             x, y = np.moveaxis(np.concatenate(columns, axis=-1), 1, 0)
-            sigmas = np.sqrt(np.einsum("mi,mij,mj->m", residual, self.weights, residual))
+            sigmas = np.sqrt(quadratic(self.weights, residual))
             within = np.minimum(sigmas, self.huber)
             robust = np.fmin(self.huber / np.maximum(sigmas, 1e-300), 1.0)
             root = np.linalg.cholesky(self.weights * robust[:, None, None])[..., None]  # its transpose whitens
@@ -100,6 +100,11 @@ class Problem:
         if self.motion is None:
             steps = np.where(self.apart[:, None, None], steps, steps[:, :1])
         return moved(model, shared[:N_STEREO], steps, self.shape_basis @ shared[N_STEREO:])
+
+
+def quadratic(matrix: Array, vector: Array) -> Array:
+    """v^T M v (m,) for M (m, 2, 2) and v (m, 2)."""
+    return np.asarray(np.einsum("mi,mij,mj->m", vector, matrix, vector), np.float64)
 
 
 def inverse_covariance(covariance: Array, extra: float) -> Array:

@@ -86,8 +86,7 @@ class Prior:
 
     def shape(self, model: StereoModel) -> Array:
         """(s2,) shape of the model's target."""
-        found: Array = self.to_shape @ (model.points - self.nominal).reshape(-1)
-        return found
+        return np.asarray(self.to_shape @ (model.points - self.nominal).reshape(-1), np.float64)
 
     def normal(self, model: StereoModel) -> Array:
         """(s + 1, s + 1) `Normal.prior`: information at the model, gradient towards the prior, and its loss."""

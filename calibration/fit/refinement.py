@@ -13,7 +13,7 @@ import scipy
 from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import triangulate
 from calibration.fit.board_motion import BoardMotion, updated
-from calibration.fit.normal_equations import Normal, Problem, inverse_covariance, minimise
+from calibration.fit.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
 from calibration.fit.priors import VARIANCES, board_basis, priors_of
 from calibration.fit.stereo_model import N_STEREO, Observations, StereoModel, predict_pixels
 from calibration.kit import least_squares
@@ -80,12 +80,13 @@ def refine_stereo(
     model = replace(start, points=nominal)
     problem = Problem(observations, weights, basis, start.apart, priors_of(model, nominal, basis))
     exact = replace(problem.prior, known=problem.prior.known / VARIANCES[0])
+    residuals = observations.pixels - predict_pixels(model, observations)
     for _ in range(2):  # robust, as whole images may be wrong, and with the declared board
-        rough = problem.seeing(observations, _median_variance(model, observations))
-        rough = replace(rough, prior=exact, huber=2.0)
+        rough = replace(problem.seeing(observations, _median_variance(residuals)), prior=exact, huber=2.0)
         model = minimise(rough, model, iterations=30, tolerance=1e-5, rough=True).model
-    extra = _median_variance(model, observations)
-    kept = _accepted(problem, model, extra, reject_beyond)
+        residuals = observations.pixels - predict_pixels(model, observations)
+    extra = _median_variance(residuals)
+    kept = _accepted(problem, residuals, extra, reject_beyond)
     return refined(replace(problem, motion=motion), model, kept, extra, reject_beyond)
 
 
@@ -128,16 +129,17 @@ def _settled(
     whole, observations, total, found = problem, problem.observations, 0, np.inf
     place = problem.places
     for turn in range(2 * FREE_ROUNDS):
-        used, motion, prior = observations[kept], problem.motion, problem.prior
+        used, motion = observations[kept], problem.motion
         problem = problem.seeing(used, extra)
         seen = len(np.unique(place[kept]))
+        left = 2 * len(used) - N_STEREO - 6 * seen
         minimum = minimise(problem, model, tolerance=1e-5, damping=1e-6, rough=True)
         model, total = minimum.model, total + minimum.iterations
         # the stated noise may be too large: the prior is weighted by that of the residuals
-        noise = float(minimum.normal.costs.sum()) / max(2 * len(used) - N_STEREO - 6 * seen, 1)
+        noise = float(minimum.normal.costs.sum()) / max(left, 1)
         weight = max(float(np.nan_to_num(minimum.normal.disagreement(N_STEREO))), min(noise, 1.0), OVERSTATED)
-        learnt, determined = prior.learnt(minimum.normal, model, weight)
-        steady, dof = abs(determined - found) < 0.01, 2 * len(used) - N_STEREO - 6 * seen - determined
+        learnt, determined = problem.prior.learnt(minimum.normal, model, weight)
+        steady, dof = abs(determined - found) < 0.01, left - determined
         problem, found = replace(problem, prior=learnt), determined
         if motion is not None:
             moves, determined = updated(motion, model, minimum.normal.covariances()[1], problem.apart)
@@ -149,7 +151,7 @@ def _settled(
                 f"{len(used)} points in {seen} views are fewer than the parameters to be found: take more views"
             )
         before, extra = extra, _extra_variance(residuals[kept], used.covariance, dof)
-        good = _accepted(whole, model, extra, reject_beyond, kept if turn >= FREE_ROUNDS else True)
+        good = _accepted(whole, residuals, extra, reject_beyond, kept if turn >= FREE_ROUNDS else True)
         if steady and abs(extra - before) <= 0.01 * before + 1e-10 and bool((good == kept).all()):
             break
         if turn < 2 * FREE_ROUNDS - 1:  # the returned values are those of the fitted points
@@ -157,23 +159,20 @@ def _settled(
     return problem, model, kept, extra, dof, total
 
 
-def _median_variance(model: StereoModel, observations: Observations) -> float:
+def _median_variance(residuals: Array) -> float:
     """Variance per axis from the median of squared 2-D residuals, 2 ln 2 sigma^2 for a Gaussian."""
-    residuals = observations.pixels - predict_pixels(model, observations)
     return float(np.median(np.sum(residuals**2, axis=-1)) / (2 * np.log(2))) + 1e-12
 
 
-def _accepted(problem: Problem, model: StereoModel, extra: float, beyond: float, among: Mask | bool = True) -> Mask:
-    """Points (m,) whose residuals are below a number of sigmas, and enough of which are in their image."""
-    o, place = problem.observations, problem.places
-    good = (_mahalanobis2(o.pixels - predict_pixels(model, o), o.covariance, extra) < beyond**2) & among
-    found: Mask = good & (np.bincount(place, good)[place] >= min(LEAST_POINTS, len(model.points)))
-    return found
+def _accepted(problem: Problem, residuals: Array, extra: float, beyond: float, among: Mask | bool = True) -> Mask:
+    """Points (m,) whose residuals are below a number of sigmas; none of a place with too few of them for its pose."""
+    place = problem.places
+    good = (_mahalanobis2(residuals, problem.observations.covariance, extra) < beyond**2) & among
+    return np.asarray(good & (np.bincount(place, good)[place] >= min(LEAST_POINTS, len(problem.shape_basis))), bool)
 
 
 def _mahalanobis2(residuals: Array, covariance: Array, extra: float) -> Array:
-    weights = inverse_covariance(covariance, extra)
-    return np.asarray(np.einsum("mi,mij,mj->m", residuals, weights, residuals), np.float64)
+    return quadratic(inverse_covariance(covariance, extra), residuals)
 
 
 def _extra_variance(residuals: Array, covariance: Array, dof: float) -> float:

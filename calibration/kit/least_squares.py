@@ -9,7 +9,7 @@ Synthesis, section 6), so that the cost is linear in the number of blocks, not c
 - `eliminate`: QR of the rows of one block; does not square the condition number, and finds undetermined directions.
 
 Residuals are observed minus predicted, in standard deviations; derivatives are those of the prediction. Robust weights
-are applied by the caller: rows times the square root of the weight.
+are applied by the caller: rows times the square root of the weight, and the loss itself as the cost.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Normal:
 
     products: Array  # (n, k + s + 1, k + s + 1) of each block's data
     k: int
-    costs: Array  # (n,) chi-square; inf without a prediction
+    costs: Array  # (n,) chi-square, or a robust loss; inf without a prediction
     prior: Array  # (s + 1, s + 1) [shared | residual] of the prior, with its loss in the place of chi-square
 
     @property
