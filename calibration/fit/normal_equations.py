@@ -65,15 +65,15 @@ class Problem:
                 place = o.camera * (self.apart[o.view] | (self.motion is not None))
                 d_pose = np.concatenate([np.where((place == c)[:, None, None], d_pose, 0.0) for c in (0, 1)], axis=-1)
             residual = o.pixels - pixels
-            columns = [d_pose, d_stereo, d_point @ self.shape_basis[o.point], residual[..., None]]
-            columns[3:3] = [] if beyond is None else [beyond]
-            x, y = np.moveaxis(np.concatenate(columns, axis=-1), 1, 0)
             sigmas = np.sqrt(quadratic(self.weights, residual))
             within = np.minimum(sigmas, self.huber)
             robust = np.fmin(self.huber / np.maximum(sigmas, 1e-300), 1.0)
-            root = np.linalg.cholesky(self.weights * robust[:, None, None])[..., None]  # its transpose whitens
-            rows = np.concatenate([root[:, 0, 0] * x + root[:, 1, 0] * y, root[:, 1, 1] * y])
-            view = np.tile(o.view, 2)
+            whitener = np.swapaxes(np.linalg.cholesky(self.weights * robust[:, None, None]), 1, 2)
+            columns = [whitener @ of for of in (d_pose, d_stereo, d_point, residual[..., None])]
+            columns[2] = columns[2] @ self.shape_basis[o.point]
+            columns[3:3] = [] if beyond is None else [whitener @ beyond]
+            rows = np.concatenate(columns, axis=-1).reshape(2 * len(o), -1)
+            view = np.repeat(o.view, 2)
             linear: Array = np.bincount(o.view, within * (sigmas - within), V).astype(float)
         if self.motion is not None:
             between, by_poses = motions(model)

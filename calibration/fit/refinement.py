@@ -14,7 +14,7 @@ from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import triangulate
 from calibration.fit.board_motion import BoardMotion, updated
 from calibration.fit.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
-from calibration.fit.priors import VARIANCES, board_basis, priors_of
+from calibration.fit.priors import board_basis, priors_of
 from calibration.fit.stereo_model import N_STEREO, Observations, StereoModel, predict_pixels
 from calibration.kit import least_squares
 from calibration.kit.arguments import checked
@@ -79,10 +79,11 @@ def refine_stereo(
     basis, weights = board_basis(nominal), inverse_covariance(observations.covariance, 0.0)
     model = replace(start, points=nominal)
     problem = Problem(observations, weights, basis, start.apart, priors_of(model, nominal, basis))
-    exact = replace(problem.prior, known=problem.prior.known / VARIANCES[0])
+    # robust, as whole images may be wrong, and with the declared board
+    rough = Problem(observations, weights, basis[..., :0], start.apart, priors_of(model, nominal, basis[..., :0]), 2.0)
     residuals = observations.pixels - predict_pixels(model, observations)
-    for _ in range(2):  # robust, as whole images may be wrong, and with the declared board
-        rough = replace(problem.seeing(observations, _median_variance(residuals)), prior=exact, huber=2.0)
+    for _ in range(2):
+        rough = rough.seeing(observations, _median_variance(residuals))
         model = minimise(rough, model, iterations=30, tolerance=1e-5, rough=True).model
         residuals = observations.pixels - predict_pixels(model, observations)
     extra = _median_variance(residuals)

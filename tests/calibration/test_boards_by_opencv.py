@@ -193,7 +193,7 @@ def test_motions_that_no_pair_shows_for_itself_are_in_the_sigma():
 
 
 def test_a_rig_file_keeps_where_the_boards_were(tmp_path):
-    found = calibrated(moved_boards.make_rig(1), 6, 1, shift=1e-3, turn=1e-3)
+    found = calibrated(moved_boards.make_rig(1), 4, 1, shift=1e-3, turn=1e-3)
     assert found.refinement.model.apart.all()
     write_rig(tmp_path / "rig.h5", found)
     _, record = read_rig_file(tmp_path / "rig.h5")
