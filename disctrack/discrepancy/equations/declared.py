@@ -187,8 +187,7 @@ class Samples:
     knots: Array  # (m,) [s] of the inputs
     pieces: Array  # (c, 5, m - 1) cubics, highest power first, and a further slope (of a step)
     constants: Mapping[str, float]
-    start: Mapping[str, float]
-    known: Mapping[str, tuple[float, float]]
+    known: Mapping[str, tuple[float, float]]  # states at the first sample, with sigmas; infinite: initial guesses
     groups: Mapping[str, str]  # by kind, "run" among them
     noise: SmoothNoise | None = None
     fit_until: float | None = None
@@ -205,7 +204,7 @@ class Samples:
         own = first == 0
         return replace(
             self, stretch=self.stretch + first, time=self.time[rows], data=self.data[rows], sigma=self.sigma[rows],
-            start=self.start if own else {}, known=self.known if own else {}, at_rest=self.at_rest and own,
+            known=self.known if own else {}, at_rest=self.at_rest and own,
         )  # fmt: skip
 
 
@@ -261,10 +260,11 @@ def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[s
         raise AnalysisError(f"run {name}: fewer than 8 samples have data.")
     if np.any(sigma <= 0):
         raise AnalysisError(f"run {name}, sigma: must be positive.")
-    known_states = {k: (v[0], v[1]) if isinstance(v, tuple) else (float(v), 0.0) for k, v in run.known.items()}
+    known_states = {k: (float(v), np.inf) for k, v in run.start.items()}
+    known_states |= {k: (v[0], v[1]) if isinstance(v, tuple) else (float(v), 0.0) for k, v in run.known.items()}
     knots, pieces = _inputs(equations, run, name, time)
     return Samples(
-        name, 0, time - time[0], data, sigma, knots, pieces, dict(run.constants), dict(run.start), known_states,
+        name, 0, time - time[0], data, sigma, knots, pieces, dict(run.constants), known_states,
         {**run.groups, "run": name}, run.noise, run.fit_until, run.at_rest,
     )  # fmt: skip
 

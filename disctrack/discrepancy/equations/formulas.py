@@ -1,7 +1,7 @@
 """Declared equations and terms, differentiated and compiled: rates, sensors and clock as functions of parameters."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -184,31 +184,18 @@ class Formulas:
         function = sympy.lambdify((_t, self.numbers), flat, "numpy")
 
         def evaluate(time: Array, p: Array) -> tuple[Array, Array]:
-            w, values = len(self.late), np.empty((len(flat), len(time)))
-            for row, found in zip(values, function(time, p), strict=True):
-                row[:] = found
+            w, values = len(self.late), np.array([np.broadcast_to(x, time.shape) for x in function(time, p)], float)
             return values[:w], values[w:].reshape(w, len(fitted), len(time))
 
         return evaluate
 
-    @cached_property
-    def jump_arguments(self) -> Callable[..., list[Array]]:
-        """(t (m,), states (m, n), p, inputs) -> the arguments of all jumps, each (m,)."""
-        return self._along_motion(self.widths)
-
-    @cached_property
-    def shape_guesses(self) -> Callable[..., list[Array]]:
-        """(t (m,), states (m, n), p, inputs) -> the values that are tried for the shapes of `along`, each (m,)."""
-        return self._along_motion(self.along.values())
-
-    def _along_motion(self, expressions: Iterable[sympy.Expr]) -> Callable[..., list[Array]]:
+    def along_motion(
+        self, expressions: Iterable[sympy.Expr], t: Array, states: Array, p: Array, u: Sequence[Array]
+    ) -> list[Array]:
+        """Values (m,) of each expression at instants t (m,), in states (m, n), with inputs u."""
         function = sympy.lambdify((_t, self.states, self.numbers, self.inputs), list(expressions), "numpy")
-
-        def evaluate(t: Array, states: Array, p: Array, u: Sequence[Array]) -> list[Array]:
-            with np.errstate(all="ignore"):
-                return [np.broadcast_to(x, t.shape) for x in function(t, list(states.T), p, u)]
-
-        return evaluate
+        with np.errstate(all="ignore"):
+            return [np.broadcast_to(x, t.shape) for x in function(t, list(states.T), p, u)]
 
     def defaults(self) -> dict[str, float]:
         """Declared values of all entries of p; the widths of jumps are 1 until they are known."""

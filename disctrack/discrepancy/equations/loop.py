@@ -166,7 +166,7 @@ def _with_guesses(system: EquationSystem, values: Mapping[str, float]) -> Equati
     for s, motion in system.predictions(values):
         if motion is not None:
             p, u = system.numbers(values, s), system.inputs_of(s)
-            passed.append(f.shape_guesses(s.time, motion.states, p, u))
+            passed.append(f.along_motion(f.along.values(), s.time, motion.states, p, u))
     best: dict[str, tuple[float, dict[str, float]]] = {}
     amounts = [c for c in system.candidates if any(f.owner[n] == c.name for n in f.along)]
     here = no_fit(system.base, values)
@@ -214,7 +214,8 @@ def _widths(system: EquationSystem, along: Sequence[tuple[Samples, Array]]) -> d
     square, count = np.zeros(len(f.widths)), 0
     for s, states in along:
         t, p = np.linspace(s.time[0], s.time[-1], len(states)), system.numbers({}, s)
-        square += [float(np.nansum(a**2)) for a in f.jump_arguments(t, states, p, system.inputs_of(s, t))]
+        arguments = f.along_motion(f.widths, t, states, p, system.inputs_of(s, t))
+        square += [float(np.nansum(a**2)) for a in arguments]
         count += len(states)
     size = np.sqrt(square / max(count, 1))
     return {w.name: JUMP * (x or 1.0) for w, x in zip(f.widths.values(), size, strict=True)}

@@ -112,7 +112,7 @@ def initial_guess(system: EquationSystem) -> tuple[dict[str, float], Array]:
         p = system.numbers({}, s)
         begin = system.start_of({}, s)
         usable = np.flatnonzero(np.isfinite(s.data).any(axis=1))
-        given = np.array([name in s.start or name in s.known for name in names])
+        given = np.array([name in s.known for name in names])
         first = begin if given.all() else np.where(given, begin, states_from_data(f, s, p, int(usable[0]), begin))
         seen.append(first)
         values |= {f"state.{name}[{s.name}]": float(v) for name, v in zip(names, first, strict=True)}

@@ -79,7 +79,7 @@ class EquationSystem(System):
         several = len(self.stretches) > 1
         for i, s in enumerate(self.stretches):
             for name, size in zip(self.formulas.equations.states, self.sizes, strict=True):
-                value, sigma = s.known.get(name, (s.start.get(name, 0.0), np.inf))
+                value, sigma = s.known.get(name, (0.0, np.inf))
                 if sigma > 0:
                     unit = self.formulas.equations.units.get(name, "1")
                     q = Quantity(f"state.{name}[{s.name}]", unit, 1e-3 * size, value, prior_sigma=sigma,
@@ -176,9 +176,8 @@ class EquationSystem(System):
 
     def start_of(self, values: Values, s: Samples) -> Array:
         """(n,) states at the first sample."""
-        declared = {**s.start, **{k: v for k, (v, _) in s.known.items()}}
         states = self.formulas.equations.states
-        return np.array([values.get(f"state.{n}[{s.name}]", declared.get(n, 0.0)) for n in states], float)
+        return np.array([values.get(f"state.{n}[{s.name}]", s.known.get(n, (0.0,))[0]) for n in states], float)
 
     def predict(self, values: Values, s: Samples, names: Sequence[str] = ()) -> Prediction | None:
         """Prediction of a stretch, with derivatives by those of the quantities that it has (`names_of`).
