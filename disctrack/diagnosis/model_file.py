@@ -49,28 +49,26 @@ def model_toml(system: DiscSystem, values: Values, name: str) -> str:
     model, trajectory = system.model_with(values), system.trajectory
     disc, rate = model.disc, float(round(trajectory.frame_rate, 9))
     state = {k.partition(".")[2]: float(v) for k, v in values.items() if k.startswith("state.")}
-    bare = Scene(name=name, gravity_m_s2=model.gravity, air_density_kg_m3=model.air_density)
-    rolling = replace(
-        bare.motion.rolling,
-        theta_deg=float(np.degrees(state["theta"])),
-        nutation_deg=0.0,
-        state=state,
-        effects={e.name: dict(e.values) for e in model.effects},
-        formulas={e.name: dict(e.formulas) for e in model.effects if e.formulas},
-    )
-    width, height = rig.left.image_size
     sizes = {"radius_mm": disc.radius, "thickness_mm": 2 * disc.half_thickness, "mass_g": disc.mass}
     dots = tuple((_rounded(x), _rounded(y)) for x, y in disc.marker_centres_body[:, :2])
-    scene = replace(
-        bare,
+    rolling = {
+        "theta_deg": float(np.degrees(state["theta"])),
+        "nutation_deg": 0.0,
+        "state": state,
+        "effects": {e.name: dict(e.values) for e in model.effects},
+        "formulas": {e.name: dict(e.formulas) for e in model.effects if e.formulas},
+    }
+    image_size = tuple(map(int, rig.left.image_size))
+    scene = Scene().changed(
+        name=name,
+        gravity_m_s2=model.gravity,
+        air_density_kg_m3=model.air_density,
         rig=_settings_like(rig),
-        cameras=replace(
-            bare.cameras, frame_rate_hz=rate, n_frames=len(system.time), image_size=(int(width), int(height))
-        ),
-        disc=replace(bare.disc, **{key: _rounded(size) for key, size in sizes.items()}),
-        markers=replace(bare.markers, diameter_mm=_rounded(disc.marker_diameter), centres_mm=dots),
+        cameras={"frame_rate_hz": rate, "n_frames": len(system.time), "image_size": image_size},
+        disc={key: _rounded(size) for key, size in sizes.items()},
+        markers={"diameter_mm": _rounded(disc.marker_diameter), "centres_mm": dots},
         faults=scene_faults(disc, values, rate),
-        motion=replace(bare.motion, kind="rolling", rolling=rolling),
+        motion={"kind": "rolling", "rolling": rolling},
     )
     first, last = (int(trajectory.frame[i]) for i in (system.rows.start, system.rows.stop - 1))
     header = (

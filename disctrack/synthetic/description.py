@@ -235,6 +235,16 @@ class Scene:
             d.radius_mm, d.thickness_mm, d.mass_g, [list(c) for c in self.markers.centres_mm], self.markers.diameter_mm
         )
 
+    def changed(self, **values: object) -> "Scene":
+        """Copy with other values; those of a section in a dictionary, as in the TOML file."""
+        return _changed(self, values)
+
+
+def _changed(settings: Any, values: object) -> Any:
+    if not isinstance(values, dict) or isinstance(settings, dict):
+        return values
+    return replace(settings, **{key: _changed(getattr(settings, key), value) for key, value in values.items()})
+
 
 def load_scene(path: str | Path) -> Scene:
     """Scene from a TOML file; missing keys have their defaults.
@@ -245,7 +255,7 @@ def load_scene(path: str | Path) -> Scene:
     return scene_from_tree(read_toml(path, SceneError), where=str(path), folder=path.parent)
 
 
-def scene_from_tree(tree: dict[str, Any], where: str = "scene", folder: Path = Path()) -> Scene:
+def scene_from_tree(tree: dict[str, object], where: str = "scene", folder: Path = Path()) -> Scene:
     """Scene from nested dictionaries as returned by tomllib; errors as in `load_scene`."""
     scene = replace(build(Scene, tree, where), folder=folder)
     for bad, key, found, expected in _checks(scene):

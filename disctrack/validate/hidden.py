@@ -20,7 +20,7 @@ from disctrack.discrepancy.system import Candidate
 from disctrack.errors import DiscTrackError
 from disctrack.faults.catalogue import scene_faults
 from disctrack.rolling import CATALOGUE, Model, simulate
-from disctrack.synthetic.description import CameraSettings, MotionSettings, RollingMotion, Scene
+from disctrack.synthetic.description import Scene
 from disctrack.synthetic.motion import rolling_start
 from disctrack.trajectory import Trajectory
 from disctrack.validate.points import ORDINARY, Laboratory, measured
@@ -117,7 +117,7 @@ def draw(seed: int, planted: Values, rate: float = HiddenCase.rate) -> Scene:
     """A random motion that, with the planted effects, lasts for the whole recording."""
     rng = np.random.default_rng([seed, 31])
     disc = Scene().declared_disc
-    faults = scene_faults(disc, planted, rate)
+    scene = Scene(seed=seed, faults=scene_faults(disc, planted, rate))
     of_motion = {name: value for name, value in planted.items() if name.partition(".")[0] in CATALOGUE}
     for _ in range(200):
         theta = float(rng.uniform(3.0, 15.0))  # [deg]
@@ -126,9 +126,9 @@ def draw(seed: int, planted: Values, rate: float = HiddenCase.rate) -> Scene:
         omega3 = float(rng.uniform(-2.0, 3.0))  # [rad/s]
         model = Model(disc).with_values({"km.k_m": float(rng.uniform(0.2e-7, 0.5e-7))} | of_motion)
         effects = {effect.name: dict(effect.values) for effect in model.effects}
-        rolling = RollingMotion(theta_deg=theta, nutation_deg=nutation, omega3_rad_s=omega3, effects=effects)
-        motion_of = MotionSettings("rolling", rolling=rolling)
-        scene = Scene(seed=seed, cameras=CameraSettings(rate, n), motion=motion_of, faults=faults)
+        rolling = {"theta_deg": theta, "nutation_deg": nutation, "omega3_rad_s": omega3, "effects": effects}
+        cameras = {"frame_rate_hz": rate, "n_frames": n}
+        scene = scene.changed(cameras=cameras, motion={"kind": "rolling", "rolling": rolling})
         try:
             motion = simulate(model, rolling_start(scene), duration=1.03 * n / rate + 0.01, rate=rate)
         except DiscTrackError:  # no regular precession exists

@@ -5,7 +5,7 @@ the recording are those of any user's recording. A comparison uses only the trut
 """
 
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -65,12 +65,8 @@ def scene_of(seed: int, quick: bool = False) -> Scene:
     scene = Scene(name=f"validation {seed}", seed=seed)
     if not quick:
         return scene
-    return replace(
-        scene,
-        cameras=replace(scene.cameras, image_size=(272, 272)),
-        rig=replace(scene.rig, mm_per_px=0.42),
-        board=replace(scene.board, n_views=12, square_mm=6.0, shift_mm=15.0),
-    )
+    board = {"n_views": 12, "square_mm": 6.0, "shift_mm": 15.0}
+    return scene.changed(cameras={"image_size": (272, 272)}, rig={"mm_per_px": 0.42}, board=board)
 
 
 def rendered_cases(n: int | None, seed: int, quick: bool = False, imperfect: bool = False) -> list[Scene]:
@@ -104,9 +100,8 @@ def ideal_cases(scene: Scene, n_static: int, n_rolling: int) -> list[Scene]:
 
 def at_rest(scene: Scene, q: Array) -> Scene:
     """The scene with static poses q (n, 6), one frame each."""
-    rows = (q * np.r_[np.full(3, 1e3), np.full(3, 180 / np.pi)]).tolist()
-    poses = tuple((x, y, z, psi, theta, phi) for x, y, z, psi, theta, phi in rows)
-    return replace(scene, name=STATIC, motion=replace(scene.motion, kind="static", poses=poses))
+    poses = tuple(map(tuple, q * np.r_[np.full(3, 1e3), np.full(3, 180 / np.pi)]))
+    return scene.changed(name=STATIC, motion={"kind": "static", "poses": poses})
 
 
 def imperfect_case(scene: Scene, frames: int) -> Scene:
@@ -117,40 +112,32 @@ def imperfect_case(scene: Scene, frames: int) -> Scene:
         GlareSettings(name, (rng.uniform(0.3, 0.7) * width, rng.uniform(0.3, 0.7) * height), 0.18 * width, 12.0)
         for name in CAMERAS
     )
-    scene = replace(
-        scene,
-        imperfections=replace(
-            scene.imperfections,
-            lens_field_px=0.02,
-            board_bow_mm=0.06 if scene.seed % 2 else -0.06,
-            board_stretch=2e-4,
-            pixel_gain=0.01,
-            column_offset_dn=0.3,
-            response_curve=0.03,
-        ),
-        optics=replace(scene.optics, vignetting=0.15),
-        light=replace(scene.light, glare=spots),
+    scene = scene.changed(
+        imperfections={
+            "lens_field_px": 0.02,
+            "board_bow_mm": 0.06 if scene.seed % 2 else -0.06,
+            "board_stretch": 2e-4,
+            "pixel_gain": 0.01,
+            "column_offset_dn": 0.3,
+            "response_curve": 0.03,
+        },
+        optics={"vignetting": 0.15},
+        light={"glare": spots},
     )
     return rolling_scene(scene, IMPERFECT, rng.uniform(8, 16), frames, rng)
 
 
 def rolling_scene(scene: Scene, name: str, theta_deg: float, n: int, rng: np.random.Generator) -> Scene:
     """The scene with n frames of rolling from nutation `theta_deg` and random psi and phi."""
-    x, y = scene.rig.target_mm[:2]
-    start = replace(
-        scene.motion.rolling,
-        theta_deg=theta_deg,
-        psi_deg=rng.uniform(-180, 180),
-        phi_deg=rng.uniform(-180, 180),
-        centre_mm=(x, y),
-        effects={"km": {}},  # with the published coefficient
-    )
-    return replace(
-        scene,
-        name=name,
-        cameras=replace(scene.cameras, n_frames=n, exposure_s=EXPOSURE),
-        motion=replace(scene.motion, kind="rolling", rolling=start),
-    )
+    start = {
+        "theta_deg": theta_deg,
+        "psi_deg": rng.uniform(-180, 180),
+        "phi_deg": rng.uniform(-180, 180),
+        "centre_mm": scene.rig.target_mm[:2],
+        "effects": {"km": {}},  # with the published coefficient
+    }
+    cameras = {"n_frames": n, "exposure_s": EXPOSURE}
+    return scene.changed(name=name, cameras=cameras, motion={"kind": "rolling", "rolling": start})
 
 
 def render_and_measure(scene: Scene) -> RenderedOutcome:

@@ -9,7 +9,7 @@ from disctrack.discrepancy.fit import fit
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_quaternion
 from disctrack.rolling import CATALOGUE, Model
-from disctrack.synthetic.description import CameraSettings, MotionSettings, RollingMotion, Scene
+from disctrack.synthetic.description import Scene
 from disctrack.track.pose import DotsInFrames
 from disctrack.validate import points
 from disctrack.validate.points import SIGMA_PX
@@ -30,10 +30,10 @@ def measured(
     of_points = {name: other.pop(name) for name in ("laboratory", "motion", "sigma_px") if name in other}
     start = {"theta_deg": 14.0, "nutation_deg": 0.5, "omega3_rad_s": other.pop("omega3", 1.0)} | other
     formulas = {law.name: law.formulas for law in laws}
-    rolling = RollingMotion(**start, effects={e.name: e.values for e in model.effects}, formulas=formulas)
-    motion, cameras = MotionSettings("rolling", rolling=rolling), CameraSettings(declared_rate, n)
+    rolling = start | {"effects": {e.name: e.values for e in model.effects}, "formulas": formulas}
+    motion, cameras = {"kind": "rolling", "rolling": rolling}, {"frame_rate_hz": declared_rate, "n_frames": n}
     day, noise = (seed, None) if rig_seed is None else (rig_seed, seed)
-    scene = Scene(seed=day, cameras=cameras, motion=motion, faults=faults or Faults())
+    scene = Scene(seed=day, faults=faults or Faults()).changed(cameras=cameras, motion=motion)
     return points.measured(scene, noise_seed=noise, **of_points)
 
 

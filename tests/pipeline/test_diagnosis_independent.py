@@ -21,8 +21,7 @@ from tests.pipeline.conftest import QUICK
 
 def small_scene(seed, n_frames, frame_rate):
     """A quarter of the pixels and few chessboard views."""
-    scene = scene_of(seed, quick=True)
-    return replace(scene, cameras=replace(scene.cameras, frame_rate_hz=frame_rate, n_frames=n_frames))
+    return scene_of(seed, quick=True).changed(cameras={"frame_rate_hz": frame_rate, "n_frames": n_frames})
 
 
 def hide(folder, scene, body):

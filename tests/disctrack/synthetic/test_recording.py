@@ -75,7 +75,7 @@ def upper_face_visible(q, rig, index):
 def test_dots_lie_where_opencv_projects_their_outlines(q, index, rig):
     if not upper_face_visible(q, rig, index):
         pytest.skip("this camera looks at the underside")
-    without = replace(PLAIN, appearance=replace(PLAIN.appearance, dot=PLAIN.appearance.paper))
+    without = PLAIN.changed(appearance={"dot": PLAIN.appearance.paper})
     light, seen = (expected_disc(q, rig, MA_2014, scene)[0, index].astype(float) for scene in (without, PLAIN))
     dark = light - seen
     R = rotation_from_euler(*q[3:])
@@ -93,8 +93,7 @@ def test_dots_lie_where_opencv_projects_their_outlines(q, index, rig):
 @pytest.mark.parametrize("index", [0, 1])
 @pytest.mark.parametrize("q", POSES)
 def test_silhouette_is_the_hull_of_both_projected_rims(q, index, rig):
-    same = {name: 200.0 for name in ("paper", "dot", "rim", "side", "underside")}
-    scene = replace(PLAIN, appearance=replace(PLAIN.appearance, **same))
+    scene = PLAIN.changed(appearance=dict.fromkeys(("paper", "dot", "rim", "side", "underside"), 200.0))
     image = expected_disc(q, rig, MA_2014, scene)[0, index].astype(float)
     R = rotation_from_euler(*q[3:])
     rims = np.concatenate([circle([0, 0, z * MA_2014.half_thickness], MA_2014.radius) for z in (-1, 1)])
@@ -108,10 +107,10 @@ def test_silhouette_is_the_hull_of_both_projected_rims(q, index, rig):
 
 @pytest.mark.parametrize("index", [0, 1])
 def test_black_squares_lie_where_opencv_projects_them(index, rig):
-    scene = replace(PLAIN, appearance=replace(PLAIN.appearance, board_white=0.0, board_black=200.0))
+    board = {"board_white": 0.0, "board_black": 200.0}
+    fine = PLAIN.changed(appearance=board, cameras={"bit_depth": 16}, render={"subpixels": 5})
     R = rotation_from_euler(0.4, 0.3, -0.2)
     t = np.array([0.002, 0.004, 0.012])
-    fine = replace(scene, cameras=description.CameraSettings(bit_depth=16), render=replace(scene.render, subpixels=5))
     image = render_board(R, t, rig, fine)[0, index] / (65535 / 255)
     total, moment = 0.0, np.zeros(2)
     for i in range(-1, 9):
@@ -139,16 +138,13 @@ def test_an_error_of_the_lens_model_would_be_noticed(rig):
 
 
 # both cameras straight above the table at half the usual size: image x is world i, 0.5 mm per pixel
-ABOVE = replace(
-    PLAIN,
-    cameras=description.CameraSettings(image_size=(256, 256), exposure_s=0.001),
-    rig=description.RigSettings(
-        mm_per_px=0.5, azimuth_deg=(-90.0, -90.0), variation=0.0,
-        **dict.fromkeys(("off_vertical_deg", "k1", "k2", "p1", "p2"), (0.0, 0.0)),
-    ),
-    appearance=replace(PLAIN.appearance, rim=190.0),
-    optics=replace(PLAIN.optics, blur_px=(0.8, 1.3)),
-)  # fmt: skip
+ABOVE = PLAIN.changed(
+    cameras={"image_size": (256, 256), "exposure_s": 0.001},
+    rig=dict.fromkeys(("off_vertical_deg", "k1", "k2", "p1", "p2"), (0.0, 0.0))
+    | {"mm_per_px": 0.5, "azimuth_deg": (-90.0, -90.0), "variation": 0.0},
+    appearance={"rim": 190.0},
+    optics={"blur_px": (0.8, 1.3)},
+)
 FLAT = np.array([0.032, 0.020, 0.001, 0.0, 0.0, 0.0])  # upper face at the target's height of 4 mm: 0.5 mm per pixel
 DOT = 0  # at (26, 0) mm
 AWAY = np.array([5.0, 0, 0, 0, 0, 0])  # out of sight
@@ -223,8 +219,8 @@ def test_full_well_clips_and_black_level_lifts():
 
 
 def test_vignetting_and_gradient_are_where_the_scene_puts_them(top_rig):
-    light, optics = description.LightSettings(gradient_per_m=(2.0, 0.0)), replace(ABOVE.optics, vignetting=0.2)
-    scene = replace(ABOVE, appearance=replace(ABOVE.appearance, table=100.0), optics=optics, light=light)
+    light = description.LightSettings(gradient_per_m=(2.0, 0.0))
+    scene = ABOVE.changed(appearance={"table": 100.0}, optics={"vignetting": 0.2}, light=light)
     away = FLAT + AWAY
     image = expected_disc(away, top_rig, MA_2014, scene)[0, 0]
     assert image[128, 128] == pytest.approx(100.0, abs=0.2)
@@ -393,9 +389,8 @@ def test_board_lies_with_the_side_of_dark_corners_on_the_left(scene, tmp_path):
 
 def test_a_recording_declares_the_disc_of_any_scene_as_it_is(tmp_path):
     places = tuple((12.3456789 * np.cos(a), 12.3456789 * np.sin(a)) for a in (0.1, 1.3, 3.1, 4.4))
-    scene = replace(
-        SMALL, name='the "third"\\\n run', markers=description.MarkerSettings(diameter_mm=5.123456, centres_mm=places)
-    )
+    markers = {"diameter_mm": 5.123456, "centres_mm": places}
+    scene = SMALL.changed(name='the "third"\\\n run', markers=markers)
     (tmp_path / "recording.toml").write_text(recording_toml(scene))
     recording = read_recording(tmp_path)
     assert recording.name == scene.name
@@ -411,8 +406,7 @@ def test_faults_never_show_in_recording_toml(scene):
 @pytest.mark.statistical
 def test_same_scene_gives_the_same_files_on_any_number_of_threads_and_another_seed_another_rig(scene, tmp_path):
     first, second = (
-        write_recording(tmp_path / name, replace(scene, render=replace(scene.render, threads=n)))
-        for name, n in (("a", 1), ("b", 3))
+        write_recording(tmp_path / name, scene.changed(render={"threads": n})) for name, n in (("a", 1), ("b", 3))
     )
     assert_array_equal(images(tmp_path / "a", "right"), images(tmp_path / "b", "right"))
     assert_array_equal(first.markers_px, second.markers_px)
@@ -513,7 +507,7 @@ def test_mistakes_in_a_scene_are_named(text, message, tmp_path):
 
 
 def test_a_lens_that_folds_is_refused():
-    lens = replace(SMALL, rig=replace(SMALL.rig, k1=(-30.0, -30.0), k2=(0.0, 0.0)))
+    lens = SMALL.changed(rig={"k1": (-30.0, -30.0), "k2": (0.0, 0.0)})
     with pytest.raises(SceneError, match="folds inside the picture"):
         expected_disc(START, rig_of(lens), lens.declared_disc, lens)
 

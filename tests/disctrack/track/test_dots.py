@@ -77,10 +77,8 @@ def test_the_centre_of_the_ellipse_would_have_been_biased(rendered_pairs):
 def test_dots_that_are_all_edge_have_no_bias(mm_per_px, blur_px, thinnest):
     """Half axes down to that of the blur (with the pixel): the whole blurred ellipse is the template."""
     size = int(110 / mm_per_px)
-    scene = Scene()
-    cameras = replace(scene.cameras, image_size=(size, size), exposure_s=0.0)
-    near, soft = replace(scene.rig, mm_per_px=mm_per_px), replace(scene.optics, blur_px=(blur_px, blur_px))
-    scene = replace(scene, cameras=cameras, rig=near, optics=soft)
+    cameras, soft = {"image_size": (size, size), "exposure_s": 0.0}, {"blur_px": (blur_px, blur_px)}
+    scene = Scene().changed(cameras=cameras, rig={"mm_per_px": mm_per_px}, optics=soft)
     disc, rig = scene.declared_disc, rig_of(scene)
     q = disc_on_table(np.radians([3.0, 20.0, 30.0, 40.0]), np.random.default_rng(4), disc)
     q[:, :2] = [0.032, 0.02]

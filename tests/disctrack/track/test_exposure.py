@@ -1,7 +1,5 @@
 """Exposures as long as the frame interval refer to their middle; light that is added shifts templates, and is told."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -36,7 +34,7 @@ def motion(rendered_pairs):
 def filmed(pairs, motion, seed, exposure=EXPOSURE, moving=True):
     """Images of the motion, or of the disc at rest in each of its poses at mid exposure."""
     q, qdot = motion
-    scene = replace(pairs.scene, cameras=replace(pairs.scene.cameras, exposure_s=exposure))
+    scene = pairs.scene.changed(cameras={"exposure_s": exposure})
     rng = np.random.default_rng(seed)
     return render_disc(q[:, 4], pairs.rig, pairs.disc, scene, rng, qdot=qdot[:N] if moving else None)
 

@@ -25,7 +25,7 @@ def test_a_planted_effect_is_what_the_diagnosis_calls_by_that_name(name):
     """Fitted alone, it comes out at the planted size within its sigma, and leaves noise."""
     truth, planted = plant(name, sizes()[name], np.random.default_rng(7))
     scene = draw(5, planted)
-    trajectory = measured(replace(scene, cameras=replace(scene.cameras, n_frames=150)))
+    trajectory = measured(scene.changed(cameras={"n_frames": 150}))
     system = DiscSystem(trajectory, declared_model(trajectory)[0])
     candidate = next(c for c in system.candidates if set(truth) <= set(c.names))
     base = tuple(q for q in system.base if q.name not in candidate.names)

@@ -126,7 +126,7 @@ def test_static_poses_cover_the_range_and_stand_on_the_table(rng):
 
 def seen_by_both(n, scene, rng):
     """n poses that both cameras see, from 3 to 30 deg of nutation, and one view of the board."""
-    scene = replace(scene, board=replace(scene.board, n_views=1))
+    scene = scene.changed(board={"n_views": 1})
     rig, disc = rig_of(scene), scene.declared_disc
     q = rendered.static_poses(64, scene, rng)
     seen = (rendered.cameras_in_sight(q, rig, disc) == 2) & (np.radians(3) < q[:, 4]) & (q[:, 4] < np.radians(30))
@@ -147,9 +147,9 @@ def test_poses_at_rest_are_each_found_without_the_one_before(rng, tmp_path):
 @pytest.mark.parametrize(("bits", "read_noise"), [(8, 16.0), (12, 3.0), (16, 0.8)])
 def test_noisy_sensors_and_more_bits_are_measured_from_the_first_pair_on(bits, read_noise, rng, tmp_path):
     """The noise is measured before dots are judged by it: what is large in grey values is not a misfit."""
-    scene = rendered.scene_of(2, quick=True)
-    cameras, sensor = replace(scene.cameras, bit_depth=bits), replace(scene.sensor, read_noise_dn=read_noise)
-    tracking, truth = located(seen_by_both(3, replace(scene, cameras=cameras, sensor=sensor), rng), tmp_path)
+    sensor = {"read_noise_dn": read_noise}
+    scene = rendered.scene_of(2, quick=True).changed(cameras={"bit_depth": bits}, sensor=sensor)
+    tracking, truth = located(seen_by_both(3, scene, rng), tmp_path)
     found = compare(part(tracking.trajectory, slice(None, None, 2)), truth.q)
     assert found.usable.all()
     # on 40 numbers chance allows 1 +- 0.33

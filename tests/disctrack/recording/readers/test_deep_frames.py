@@ -1,7 +1,5 @@
 """Frames of more than 8 bits are used as they are: units of grey change nothing, finer rounding does."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -25,9 +23,8 @@ def dim():
     """
     scene = load_scene(SCENE)
     surfaces = ("paper", "dot", "rim", "side", "underside")
-    dark = replace(scene.appearance, **{name: 0.08 * getattr(scene.appearance, name) for name in surfaces})
-    cameras, sensor = replace(scene.cameras, n_frames=N, bit_depth=12), replace(scene.sensor, read_noise_dn=0.05)
-    scene = replace(scene, appearance=dark, cameras=cameras, sensor=sensor)
+    dark = {name: 0.08 * getattr(scene.appearance, name) for name in surfaces}
+    scene = scene.changed(appearance=dark, cameras={"n_frames": N, "bit_depth": 12}, sensor={"read_noise_dn": 0.05})
     q = motion_of(scene)[0](np.arange(N) / 1000.0)
     rig, disc = rig_of(scene), scene.declared_disc
     return render_disc(q, rig, disc, scene, np.random.default_rng(5)), rig, disc, q[:, :3]
