@@ -214,16 +214,12 @@ def _inside(q: Array, rig: StereoRig, disc: Disc) -> bool:
 def cameras_in_sight(q: Array, rig: StereoRig, disc: Disc) -> NDArray[np.int64]:
     """(n,) number of cameras that see enough dots for a pose, 0 to 2, in the poses q (n, 6).
 
-    The upper face must face the camera. The image of a dot is an ellipse whose semi-minor axis
-    f R cos(gamma) / distance must be above SMALLEST_SEMI_MINOR_PX.
+    The upper face must face the camera, and the semi-minor axis of the image of a dot, which is an ellipse, must be
+    above SMALLEST_SEMI_MINOR_PX.
     """
     R = rotation_from_euler(*q[:, 3:].T)
-    dots = disc.marker_centres_body @ np.swapaxes(R, 1, 2) + q[:, None, :3]
-    cameras = np.zeros(len(q), np.int64)
-    for camera, (R_cw, t_cw) in zip(rig.cameras, rig.camera_poses(), strict=True):
-        ray = -R_cw.T @ t_cw - dots
-        distance = np.linalg.norm(ray, axis=-1)
-        cosine = np.einsum("nmi,ni->nm", ray, R[:, :, 2]) / distance
-        semi_minor = camera.fx * disc.marker_diameter / 2 * cosine / distance
-        cameras += np.sum(semi_minor > SMALLEST_SEMI_MINOR_PX, axis=1) >= MIN_DOTS
-    return cameras
+    _, by_point, _ = rig.project_with_jacobians(disc.marker_centres_body @ np.swapaxes(R, 1, 2) + q[:, None, :3])
+    half_axes = 0.5 * disc.marker_diameter * by_point @ R[:, None, None, :, :2]  # of the ellipses, conjugate
+    facing = np.linalg.det(half_axes) < 0  # y of the image points down
+    semi_minor = facing * np.linalg.svd(half_axes, compute_uv=False)[..., 1]
+    return np.sum(np.sum(semi_minor > SMALLEST_SEMI_MINOR_PX, axis=2) >= MIN_DOTS, axis=1)
