@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from json import JSONDecodeError, loads
 from pathlib import Path
@@ -33,7 +33,7 @@ from disctrack.files.toml_tree import toml_value
 from disctrack.findings import DoubtWarning, Finding, Kind, Severity, finding_from_json
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import Recording, read_recording
-from disctrack.synthetic.description import Scene
+from disctrack.synthetic.description import CameraSettings, Scene
 from disctrack.synthetic.recording import write_recording
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_trajectory
@@ -53,10 +53,9 @@ Change = Callable[[Path, Tree, float], Array | None]
 
 @dataclass(frozen=True)
 class Ground:
-    """A recording without faults."""
+    """A recording without faults, processed."""
 
     recording: Path  # its folder
-    rig: Path
     scene: Scene | None  # None if it was filmed
     q: Array  # (n, 6) by frame: true or measured
 
@@ -88,34 +87,35 @@ class FaultOutcome:
     named: bool
     code: int  # exit code
 
-    @property
-    def complaint(self) -> str:
-        """Failure of the validation; empty if there is none."""
-        where = f"{self.make}: {self.fault} of {self.size:.3g} {self.unit}"
-        if self.code not in (0, 1, 3):
-            return f"{where}: exit code {self.code}"
-        if self.worst > MOST_SIGMAS and not self.named:
-            return f"{where}: {self.worst:.1f} sigma off, and not named ({self.told})"
-        return ""
-
 
 def untouched(folder: Path, recordings: Sequence[Path], seed: int = 29) -> Iterator[Ground]:
     """A rendered recording, and the first pairs of each of these recordings, processed without any fault."""
     scene = rolling_scene(scene_of(seed, quick=True), "rendered", THETA_DEG, PAIRS, np.random.default_rng([seed, 34]))
-    scene = replace(scene, cameras=replace(scene.cameras, exposure_s=Scene().cameras.exposure_s))
-    truth = write_recording(folder / "rendered", scene)
-    yield _ground(folder / "rendered", scene, truth.q)
+    scene = scene.changed(cameras={"exposure_s": CameraSettings().exposure_s})
+    yield _ground(folder / scene.name, scene, write_recording(folder / scene.name, scene).q)
     for path in recordings:
-        filmed = read_recording(path)
-        declare(folder / filmed.name, _copied(filmed, folder / filmed.name))
-        yield _ground(folder / filmed.name, None, None)
+        yield _ground(_first_pairs(read_recording(path), folder), None, None)
 
 
 def _ground(folder: Path, scene: Scene | None, q: Array | None) -> Ground:
     code, findings, trajectory = _run(folder)
     if code or trajectory is None:
         raise DiscTrackError(f"{folder.name}: something is wrong before anything is planted: {_said(findings)}")
-    return Ground(folder, folder / "results" / "rig.h5", scene, trajectory.q if q is None else q)
+    return Ground(folder, scene, trajectory.q if q is None else q)
+
+
+def _first_pairs(recording: Recording, folder: Path) -> Path:
+    """Copy the first pairs and the views of a recording into a folder of its name, renumbered; returns the folder."""
+    folder, tree = folder / recording.name, dict(recording.declared)
+    for section, place, most in (("cameras", "", PAIRS), ("calibration", "calibration/", None)):
+        for camera in CAMERAS:
+            files = sorted(recording.folder.glob(tree[section][camera]))[:most]
+            tree[section][camera] = f"{place}{camera}/*{files[0].suffix}"
+            (folder / place / camera).mkdir(parents=True)
+            for number, file in enumerate(files):
+                shutil.copy(file, folder / place / camera / f"{number:06d}{file.suffix}")
+    declare(folder, tree)
+    return folder
 
 
 def fault_cases(grounds: Sequence[Ground]) -> list[FaultCase]:
@@ -129,7 +129,10 @@ def plant_and_run(case: FaultCase) -> FaultOutcome:
     planting = plantings(ground)[fault]
     folder = ground.recording.with_name(f"{ground.recording.name} {fault} {size:g}")
     try:
-        tree = _copied(read_recording(ground.recording), folder, None if planting.of_views else ground.rig)
+        shutil.copytree(ground.recording, folder, ignore=shutil.ignore_patterns("results"))
+        tree = dict(read_recording(folder).declared)
+        if not planting.of_views:
+            tree["calibration"] = {"rig": str(ground.recording / "results" / "rig.h5")}
         q = planting.change(folder, tree, size)
         declare(folder, tree)
         code, findings, trajectory = _run(folder)
@@ -169,13 +172,8 @@ def _in_sigmas(trajectory: Trajectory | None, q: Array) -> float:
 
 
 def plantings(ground: Ground) -> dict[str, Planting]:
-    """All faults that can be planted into such a recording, by name."""
-    return {fault.name: planting for fault, planting in _of_catalogue(ground)} | CHANGES
-
-
-def _of_catalogue(ground: Ground) -> Iterator[tuple[Fault, Planting]]:
-    """Faults of the catalogue; of those of a camera or a dot, only one."""
-    others = "right" if ground.scene is None else "left"
+    """All faults that can be planted into such a recording, by name; of those of a camera or a dot, only one."""
+    others, found = "right" if ground.scene is None else "left", {}
     recording = read_recording(ground.recording)
     for fault in faults_of(recording.disc):
         alike = fault.name.startswith((others, "misprint")) and fault.name != "misprint_0"
@@ -186,7 +184,8 @@ def _of_catalogue(ground: Ground) -> Iterator[tuple[Fault, Planting]]:
         sizes = [TYPICAL_STEPS * fault.step * size for size in SIZES]
         if fault.in_images:  # the square of an exposure, which is shorter than the period
             sizes = [size for size in sizes if size * recording.frame_rate**2 < 1]
-        yield fault, Planting(sizes, fault.unit, partial(change, fault, ground), fault.named_by)
+        found[fault.name] = Planting(sizes, fault.unit, partial(change, fault, ground), fault.named_by)
+    return found | CHANGES
 
 
 def _with(fault: Fault, size: float, disc: Disc, rate: float = 1.0) -> Faults:
@@ -200,37 +199,18 @@ def _rendered(fault: Fault, ground: Ground, folder: Path, tree: Tree, size: floa
     assert scene is not None
     wrong = _with(fault, size, scene.declared_disc, scene.cameras.frame_rate_hz)
     shutil.rmtree(folder)
-    return write_recording(folder, replace(scene, faults=wrong, board=replace(scene.board, n_views=1))).q
+    return write_recording(folder, scene.changed(faults=wrong, board={"n_views": 1})).q
 
 
 def _declared_wrong(fault: Fault, ground: Ground, folder: Path, tree: Tree, size: float) -> None:
     """Change the declaration and the rig so that the unchanged images have the fault."""
-    disc, rig = read_recording(ground.recording).disc, read_rig(ground.rig)
+    disc, rig = read_recording(ground.recording).disc, read_rig(tree["calibration"]["rig"])
     wrong = _with(fault, -size, disc)
     tree["markers"]["centres_mm"] = (1e3 * centres_with(wrong, disc)[:, :2]).tolist()
     tree["disc"]["thickness_mm"] = 2e3 * float(disc.half_thickness + 1e-3 * wrong.pattern_height_mm)
     tree["cameras"]["frame_rate_hz"] *= wrong.frame_rate_hz or 1.0
     tree["calibration"]["rig"] = str(folder / "rig.h5")
     write_rig(folder / "rig.h5", cameras_with(wrong, rig))
-
-
-def _copied(recording: Recording, folder: Path, rig: Path | None = None) -> Tree:
-    """Copy the first pairs to a new folder, renumbered, with this rig or their own views; returns the declaration."""
-    tree: Tree = {name: dict(part) if isinstance(part, dict) else part for name, part in recording.declared.items()}
-    for camera, pattern in zip(CAMERAS, (recording.left, recording.right), strict=True):
-        tree["cameras"][camera] = _put(sorted(recording.folder.glob(pattern))[:PAIRS], folder / camera)
-        if rig is None:
-            views = sorted(recording.folder.glob(tree["calibration"][camera]))
-            tree["calibration"][camera] = _put(views, folder / f"board_{camera}")
-    return tree if rig is None else tree | {"calibration": {"rig": str(rig)}}
-
-
-def _put(files: Sequence[Path], folder: Path) -> str:
-    """Copy images, numbered in this order; returns their pattern."""
-    folder.mkdir(parents=True)
-    for number, file in enumerate(files):
-        shutil.copy(file, folder / f"{number:06d}{file.suffix}")
-    return f"{folder.name}/*{files[0].suffix}"
 
 
 def declare(folder: Path, tree: Tree) -> None:
@@ -339,7 +319,7 @@ def _wrong(section: str, key: str, *kinds: Kind) -> Planting:
 _LOST = (Kind.DROPPED_FRAMES, Kind.DELAY, Kind.ONE_SIDED)
 _REPEATED = (Kind.REPEATED_IMAGES,)
 _of_views = partial(Planting, named_by=(Kind.CALIBRATION,), of_views=True)
-_VIEWS = ("board_left", "board_right")
+_VIEWS = ("calibration/left", "calibration/right")
 CHANGES = {
     "pairs lost by both": Planting((1, 3, 10), "pairs", _files(left=_lost, right=_lost), (Kind.CLOCK_JUMP,)),
     "images lost by one": Planting((1, 3, 10, 20), "images", _files(left=_last_lost, right=_lost), _LOST),
@@ -360,9 +340,19 @@ CHANGES = {
     "negative views": _of_views((1,), "", _images(lambda image, _: cv2.bitwise_not(image), *_VIEWS)),
     "repeated views": _of_views((2, 3, 6), "times", _files(**dict.fromkeys(_VIEWS, lambda files, k: k * files))),
     "views late in one": _of_views(
-        (1, 2, 4), "views", _files(board_left=_last_lost, board_right=lambda files, k: files[k:])
+        (1, 2, 4), "views", _files(**{_VIEWS[0]: _last_lost, _VIEWS[1]: lambda files, k: files[k:]})
     ),
 }
+
+
+def complaints(outcomes: Iterable[FaultOutcome]) -> Iterator[str]:
+    """Failures of the validation."""
+    for o in outcomes:
+        where = f"{o.make}: {o.fault} of {o.size:.3g} {o.unit}"
+        if o.code not in (0, 1, 3):
+            yield f"{where}: exit code {o.code}"
+        elif o.worst > MOST_SIGMAS and not o.named:
+            yield f"{where}: {o.worst:.1f} sigma off, and not named ({o.told})"
 
 
 def faults_validation(outcomes: Sequence[FaultOutcome]) -> Validation:
@@ -372,8 +362,7 @@ def faults_validation(outcomes: Sequence[FaultOutcome]) -> Validation:
         f"Of {len(outcomes)} planted faults {len(off)} move a pose by more than {MOST_SIGMAS:g} stated sigmas; "
         f"{sum(o.named for o in off)} of these are named."
     )
-    complaints = tuple(filter(None, (o.complaint for o in outcomes)))
-    return Validation("faults", headline, [_limits(outcomes)], outcomes, complaints)
+    return Validation("faults", headline, [_limits(outcomes)], outcomes, [*complaints(outcomes)])
 
 
 def _limits(outcomes: Sequence[FaultOutcome]) -> str:

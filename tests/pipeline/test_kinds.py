@@ -227,10 +227,7 @@ def recording(sample_clip, rig_file, tmp_path):
 
     def plant(fault: str) -> Path:
         folder = linked(sample_clip, tmp_path / "day" / fault)
-        for camera in CAMERAS:
-            (folder / "calibration" / camera).rename(folder / f"board_{camera}")
         tree = tomllib.loads((folder / "recording.toml").read_text())
-        tree["calibration"] |= {camera: f"board_{camera}/*.png" for camera in CAMERAS}
         os.link(rig_file, folder / "rig.h5")
         FAULTS[fault].plant(folder, tree)
         declare(folder, tree)
