@@ -1,6 +1,6 @@
 """The true rig of a scene and the poses of its chessboard, drawn from the seed."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,8 +38,7 @@ def rig_of(scene: Scene) -> StereoRig:
     """The rig during its calibration, with the table as world."""
     rng = np.random.default_rng([scene.seed, 1])
     left, right = (_camera(scene, index, rng) for index in (0, 1))
-    places: dict[str, Any] = placed_at([(view.R_camera_world, view.t_camera_world) for view in (left, right)])
-    return StereoRig(left.camera, right.camera, **places, world_is_table=True)
+    return StereoRig(left.camera, right.camera, **placed_at([left[1:], right[1:]]), world_is_table=True)
 
 
 def _camera(scene: Scene, index: int, rng: np.random.Generator) -> View:
@@ -55,18 +54,12 @@ def _camera(scene: Scene, index: int, rng: np.random.Generator) -> View:
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])  # image x: horizontal, camera z looks along -away
     upright = np.stack([right, np.cross(-away, right), -away])
     R = rotation_from_vector(np.array([0.0, 0.0, roll])) @ upright
-    width, height = scene.cameras.image_size
     focal = s.distance_mm[index] / s.mm_per_px * (1 + 0.005 * scatter[7])
-    lens = np.array([s.k1[index], s.k2[index], s.p1[index], s.p2[index]])
-    k1, k2, p1, p2 = map(float, lens + np.array([0.01, 0.03, 2e-4, 2e-4]) * scatter[11:15])
-    camera = Camera(
-        fx=float(focal),
-        fy=float(focal * (1 + 5e-4 * scatter[8])),
-        cx=float((width - 1) / 2 + 4 * scatter[9]),
-        cy=float((height - 1) / 2 + 4 * scatter[10]),
-        distortion=(k1, k2, p1, p2, s.k3[index]),
-        image_size=scene.cameras.image_size,
-    )
+    middle = (np.array(scene.cameras.image_size) - 1) / 2 + 4 * scatter[9:11]
+    lens = np.array([s.k1[index], s.k2[index], s.p1[index], s.p2[index], s.k3[index]])
+    lens += np.array([0.01, 0.03, 2e-4, 2e-4, 0.0]) * scatter[11:16]
+    parameters = np.array([focal, focal * (1 + 5e-4 * scatter[8]), *middle, *lens])
+    camera = Camera.from_parameters(parameters, scene.cameras.image_size)
     return View(camera, R, -R @ (target + distance * away))
 
 

@@ -68,16 +68,17 @@ def expected_disc_image(
     s, pad = stage.s, stage.pad
     width, height = stage.view.camera.image_size
     rods = [r for r in scene.faults.occluders if r.camera == stage.name and r.first_frame <= frame <= r.last_frame]
-    x0, y0, x1, y1 = (0, 0, width, height) if rods else _window(_outline(q, disc, stage.view), pad + 1, width, height)
+    around = _box(_outline(q, disc, stage.view), pad + 1, (0, 0), (width, height))
+    x0, y0, x1, y1 = (0, 0, width, height) if rods else around
     image = stage.table.copy()
     if x0 < x1 and y0 < y1:
         # the window plus the radius of the blur on each side; padded coordinates start `pad` before the image
         table = stage.cells[y0 * s : (y1 + 2 * pad) * s, x0 * s : (x1 + 2 * pad) * s]
         body, face = np.zeros_like(table), np.zeros_like(table)  # coverage by the disc; grey of its face minus its side
-        whole, around = raster.body_shape(disc.radius, _top(disc)), _rims(disc.radius, _top(disc))
+        whole, rims = raster.body_shape(disc.radius, _top(disc)), _rims(disc.radius, _top(disc))
         for q_now, weight in zip(q, weights, strict=True):
             place = rotation_from_euler(*q_now[3:]), q_now[:3]
-            _add(body, weight, stage, (x0, y0), place, whole, around)
+            _add(body, weight, stage, (x0, y0), place, whole, rims)
             for step, centre, radius in _face(stage, place, disc, scene):
                 shape = raster.round_shape(centre[2], (centre[0], centre[1]), radius, disc.radius)
                 _add(face, weight * step, stage, (x0, y0), place, shape, centre + radius * _RING)
@@ -98,12 +99,9 @@ def _add(
 
     corner : x, y of the window's first pixel   around : (k, 3) points of the body that enclose the shape [m]
     """
-    (R, t), view, s = place, stage.view, stage.s
-    pixels = image_of(around @ R.T + t, view) + stage.pad
-    low = np.floor(pixels.min(axis=0)).astype(int) - 2  # margin for the arcs between the points
-    high = np.ceil(pixels.max(axis=0)).astype(int) + 3
-    (left, top), (x, y) = np.maximum(low, corner), corner
-    right, bottom = np.minimum(high, corner + np.array(cells.shape[::-1]) // s)
+    (R, t), view, s, (x, y) = place, stage.view, stage.s, corner
+    end = x + cells.shape[1] // s, y + cells.shape[0] // s
+    left, top, right, bottom = _box(image_of(around @ R.T + t, view) + stage.pad, 0, corner, end)
     if top < bottom and left < right:
         near = cells[(top - y) * s : (bottom - y) * s, (left - x) * s : (right - x) * s]
         rays = stage.rays[top : bottom + 1, left : right + 1]
@@ -158,10 +156,12 @@ def _outline(q: Array, disc: Disc, view: View) -> Array:
     return image_of(rims @ np.swapaxes(rotation_from_euler(*q[:, 3:].T), -1, -2) + q[:, None, :3], view)
 
 
-def _window(outline: Array, margin: int, width: int, height: int) -> tuple[int, int, int, int]:
-    low = np.floor(outline.min(axis=(0, 1))).astype(int) - margin - 2  # margin for the arcs between the points
-    high = np.ceil(outline.max(axis=(0, 1))).astype(int) + margin + 3
-    return max(low[0], 0), max(low[1], 0), min(high[0], width), min(high[1], height)
+def _box(outline: Array, margin: int, begin: tuple[int, int], end: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Left, top, right, bottom of the pixels around an outline, between the corners `begin` and `end` of a window."""
+    pixels = outline.reshape(-1, 2)
+    low = np.floor(pixels.min(axis=0)).astype(int) - margin - 2  # margin for the arcs between the points
+    high = np.ceil(pixels.max(axis=0)).astype(int) + margin + 3
+    return max(low[0], begin[0]), max(low[1], begin[1]), min(high[0], end[0]), min(high[1], end[1])
 
 
 def _draw_rod(cells: Array32, corner: tuple[int, int], s: int, rod: Occluder) -> None:

@@ -18,11 +18,11 @@ from calibration.kit.arrays import Array, Array32, Image
 from calibration.rig_file import write_rig_group
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError, told_as
-from disctrack.faults.dots import cameras_with, centres_with
+from disctrack.faults.dots import cameras_with, centres_with, marker_pixels
 from disctrack.frames import COORDINATES, rotation_from_euler
 from disctrack.recording.declaration import KEYS
 from disctrack.recording.declaration_text import declaration_text
-from disctrack.synthetic.cameras import board_poses, image_of, rig_of, views_of
+from disctrack.synthetic.cameras import board_poses, rig_of
 from disctrack.synthetic.description import ImperfectionSettings, Scene, load_scene, scene_toml
 from disctrack.synthetic.images import expected_board_image, expected_disc_image, stages
 from disctrack.synthetic.motion import motion_of, rolling_model, true_exposure, true_frame_rate
@@ -52,11 +52,9 @@ class Truth:
     @property
     def markers_px(self) -> Array:
         """(n, 2, m, 2) images of the centres of the dots at mid exposure, visible or not."""
-        pixels = []
-        for q, view in zip((self.q, self.q_right), views_of(self.rig_while_filming), strict=True):
-            R = rotation_from_euler(*q[:, 3:].T)
-            pixels.append(image_of(self.disc.marker_centres_body @ np.swapaxes(R, -1, -2) + q[:, None, :3], view))
-        return np.stack(pixels, axis=1)
+        q = np.stack([self.q, self.q_right])
+        R = rotation_from_euler(*np.moveaxis(q[..., 3:], -1, 0))
+        return marker_pixels(R, q[..., :3], self.rig_while_filming, self.disc.marker_centres_body)[0]
 
 
 Job = tuple[Path, Callable[[], Image]]  # a file, and the function that renders its image
