@@ -11,13 +11,13 @@ from scipy import stats
 
 from disctrack.diagnosis import DiscDiagnosis, diagnose
 from disctrack.discrepancy.fit import Fit, fit
-from disctrack.discrepancy.search import threshold
+from disctrack.discrepancy.search import Settings, threshold
 from disctrack.discrepancy.significance import wald
 from disctrack.validate.hidden import HiddenCase, Values, recorded
 from disctrack.validate.tables import Validation, table
 
 ENOUGH = 3.0  # [sigma] largest error of a coefficient that counts as correct
-AT_NOISE, HELD_OUT = 1.1, 1.2  # largest reduced chi-square, and prediction error over the noise floor
+HELD_OUT = 1.2  # largest prediction error over the noise floor
 LEVELS = (0.5, 0.2, 0.05, 0.01, 0.005)
 
 
@@ -33,6 +33,8 @@ class Verdict:
         d, nan = result.diagnosis, float("nan")
         pulls = [_pull_of(result, truth) for truth in truths]
         left = [(e.reduced_chi_square, e.ratio_to_floor) for e in (result.before, result.after) if e] or [(nan, nan)]
+        # before and after: reduced chi-square, and prediction error over the noise floor
+        self.chi_square, self.free_run = zip(left[0], left[-1], strict=True)
         self.case, self.n, self.verdict = case, len(trajectory), d.verdict
         # every effect claimed, followed by its indistinguishable alternatives in brackets
         self.found = tuple(
@@ -42,8 +44,6 @@ class Verdict:
         # largest error of a coefficient in its sigmas; NaN if none is named
         self.pull = max((p for p in pulls if p is not None), default=nan)
         self.extra = max(len(d.found) - len(truths), 0)  # number of claims in excess of hidden effects
-        self.chi_square = left[0][0], left[-1][0]  # reduced, before and after
-        self.free_run = left[0][1], left[-1][1]  # prediction error over the noise floor, before and after
         self.gain = (d.before.cost - d.after.cost) / d.noise  # decrease of chi-square by all effects claimed
         # probability that noise alone produces the improvement of the best effect; NaN: not known
         self.p_value = d.chance.p_value if d.chance else nan
@@ -62,7 +62,7 @@ class Verdict:
     @property
     def at_noise(self) -> bool:
         """Are the residuals of the fit and of the free run noise?"""
-        return self.chi_square[1] <= AT_NOISE and self.free_run[1] <= HELD_OUT
+        return self.chi_square[1] <= Settings.at_noise and self.free_run[1] <= HELD_OUT
 
     @property
     def within(self) -> bool:

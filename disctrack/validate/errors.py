@@ -11,8 +11,7 @@ from calibration.kit.arrays import Array, Mask
 from disctrack.frames import COORDINATES, rotation_from_euler, rotation_from_quaternion, vector_from_rotation
 from disctrack.trajectory import Trajectory
 
-GROSS_POSITION = 0.5e-3  # [m], above which a pose is wrong, not inaccurate
-GROSS_ROTATION = np.radians(1.0)  # likewise
+GROSS = (0.5e-3, np.radians(1.0))  # [m, rad] of position and rotation, above which a pose is wrong, not inaccurate
 
 
 @dataclass(frozen=True)
@@ -33,9 +32,8 @@ class PoseErrors:
     @property
     def gross(self) -> Mask:
         """(n,) True if the reported pose is wrong."""
-        size = [np.linalg.norm(self.error[:, part], axis=1) for part in (slice(0, 3), slice(3, 6))]
-        with np.errstate(invalid="ignore"):
-            return np.asarray((size[0] > GROSS_POSITION) | (size[1] > GROSS_ROTATION))
+        size = np.linalg.norm(self.error.reshape(-1, 2, 3), axis=2)
+        return np.asarray((size > GROSS).any(axis=1))
 
     @property
     def usable(self) -> Mask:
