@@ -19,6 +19,11 @@ def random_state(rng, theta=None):
     return State(v[0], v[1], *rng.uniform(-7, 7, 1), theta, v[4] * 3, v[5] * 3, psidot * np.sin(theta), v[7] * 5)
 
 
+def nutating(theta_deg, amplitude_deg):
+    theta, amplitude = np.radians([theta_deg, amplitude_deg])
+    return rolling.steady_precession(theta, MA_2014, omega3=1.5, nutation_amplitude=amplitude).moved(psi=0.3)
+
+
 COM = (1e-3, -5e-4, 3e-4)
 COM_EFFECT = {"centre_of_mass": dict(zip(("c_1", "c_2", "c_3"), COM, strict=True))}
 COSINE, SINE = np.array([0.3, -0.2, 0.5]), np.array([0.7, 0.4, -0.1])
@@ -150,9 +155,7 @@ def test_motion_agrees_with_the_world_vector_integration(name):
     """Tolerances: accumulated errors of two integrators at 1e-11; with k_z, its sign smoothed over 0.01 rad/s."""
     tolerance = 1e-6 if name == "friction" else 2e-9
     model, oracle = pair(name)
-    state = rolling.steady_precession(np.radians(18), MA_2014, omega3=1.5, nutation_amplitude=np.radians(2)).moved(
-        psi=0.3
-    )
+    state = nutating(18, 2)
     times = np.linspace(0, 0.25, 26)
     motion = rolling.simulate(model, state, times=times)
     solution = newton_euler.follow(oracle, newton_euler.state_from_angles(oracle, state.array), times)
@@ -166,9 +169,7 @@ def test_motion_agrees_with_the_world_vector_integration(name):
 def test_a_table_that_gives_way_follows_the_load_of_the_rigid_one(slip, c):
     """The oracle's table moves as the load on a rigid one would let it sink: the same to first order in c."""
     rigid, oracle = model_with(K_M | COM_EFFECT), newton_euler.Disc(laws=[KM_LAW], com_body=COM)
-    start = rolling.steady_precession(np.radians(18), MA_2014, omega3=1.5, nutation_amplitude=np.radians(2)).moved(
-        psi=0.3
-    )
+    start = nutating(18, 2)
     regime, fine, most = "rolling", np.linspace(0, 0.25, 1001), 1500 * c  # second order: 9e-5 and 9e-4
     if slip:  # friction's direction is held for 0.1 ms
         v_x, v_y = rolling.simulate(rigid, start, times=[0.0]).qdot[0, :2] + slip
@@ -196,9 +197,7 @@ def test_a_table_that_gives_way_follows_the_load_of_the_rigid_one(slip, c):
 def test_a_contact_that_creeps_is_one_that_slips_on_a_film(c, most):
     """The oracle slips with its inertia; ours follows the force by a series, by which 0.02 would err by a per cent."""
     rigid = model_with(K_M | COM_EFFECT)
-    start = rolling.steady_precession(np.radians(16), MA_2014, omega3=1.5, nutation_amplitude=np.radians(1)).moved(
-        psi=0.3
-    )
+    start = nutating(16, 1)
     oracle = newton_euler.Disc(laws=[KM_LAW], com_body=COM, friction=lambda speed: speed / c)
     state = newton_euler.state_from_angles(oracle, start.array)
     force = newton_euler.accelerations(oracle, state, "rolling")[2]
@@ -224,7 +223,7 @@ def test_a_contact_that_creeps_is_one_that_slips_on_a_film(c, most):
 
 def test_accelerations_of_the_motion_are_the_second_derivatives_of_its_poses():
     model, _ = pair("body")
-    state = rolling.steady_precession(np.radians(18), MA_2014, omega3=1.5, nutation_amplitude=np.radians(2))
+    state = nutating(18, 2)
     h_ = 1e-4
     motion = rolling.simulate(model, state, 0.02, rate=1 / h_)
     second = (motion.q[2:, :3] - 2 * motion.q[1:-1, :3] + motion.q[:-2, :3]) / h_**2

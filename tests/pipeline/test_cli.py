@@ -22,6 +22,7 @@ from disctrack import FrameStatus, open_pairs, read_trajectory
 from disctrack.cli import COMMANDS, main
 from disctrack.disc import MA_2014
 from disctrack.synthetic.description import Scene, load_scene
+from disctrack.validate.planted_faults import redrawn
 from tests.pipeline.conftest import QUICK, linked
 
 
@@ -220,10 +221,7 @@ def edit(recording: Path, written: str, found: str) -> None:
 
 def change_images(recording: Path, change, cameras=("left", "right")) -> None:
     for camera in cameras:
-        for file in (recording / camera).iterdir():
-            image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-            file.unlink()  # it is linked to the original, which must stay
-            assert cv2.imwrite(str(file), change(image))
+        redrawn(recording / camera, lambda image, share: change(image))
 
 
 def in_colour(image: np.ndarray) -> np.ndarray:
