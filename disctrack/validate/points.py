@@ -6,17 +6,17 @@ true one by an error drawn from its covariance. The residual lens field of a lab
 renderer; glare displaces each dot independently; the table is determined from a bowed board.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calibration.board.target import Board
-from calibration.cameras.camera import N_RIG, StereoRig
+from calibration.cameras.camera import N_RIG, StereoRig, by_turning
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import normal_of_rows
 from disctrack.disc import Disc
-from disctrack.faults.dots import cameras_with, ellipse_centre_shift
+from disctrack.faults.dots import cameras_with, ellipse_centre_shift, marker_pixels
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_euler
 from disctrack.rolling import simulate
@@ -54,14 +54,12 @@ ORDINARY = Laboratory(0.02, 0.004, 3e-6, 40e-6, 1.2e-4, 1e-4)
 
 def rig_covariance(rig: StereoRig, scene: Scene) -> Array:
     """(30, 30) from the corners of the scene's chessboard views, the first of which defines the world."""
-    corners, rows = Board(scene.board.inner_corners, scene.board.square_mm * 1e-3).points, []
-    for number, (R, t) in enumerate(zip(*board_poses(scene, rig), strict=True)):
-        arm = corners @ R.T
-        _, by_point, by_rig = rig.project_with_jacobians(arm + t)
-        by_pose = np.concatenate([by_point, np.cross(arm[:, None], by_point)], axis=-1)
-        by_pose = by_pose if number else 0.0 * by_pose  # the pose of the first view is known
-        rows.append(np.concatenate([by_pose, by_rig, np.zeros_like(by_rig[..., :1])], axis=-1).reshape(-1, N_RIG + 7))
-    return CORNER_SIGMA_PX**2 * normal_of_rows(np.stack(rows), 6).covariances()[0]
+    R, t = board_poses(scene, rig)
+    arm = Board(scene.board.inner_corners, scene.board.square_mm * 1e-3).points @ np.swapaxes(R, 1, 2)
+    _, by_point, by_rig = rig.project_with_jacobians(arm + t[:, None])
+    rows = np.concatenate([by_point, by_turning(by_point, arm[:, None]), by_rig, 0.0 * by_rig[..., :1]], axis=-1)
+    rows[0, ..., :6] = 0.0  # the pose of the first view is known
+    return CORNER_SIGMA_PX**2 * normal_of_rows(rows.reshape(len(R), -1, N_RIG + 7), 6).covariances()[0]
 
 
 def measured(
@@ -92,11 +90,7 @@ def measured(
     believed_rig = replace(believed_rig, covariance=covariance, world_is_table=True)
     motion = motion or _rolling(scene, *rng.uniform(-3, 3, 2))
     times = faults.true_times(np.arange(n) / rate, rate) + STATION
-    views = [
-        _exposed(motion, times + delay, faults, true_rig, disc)[:, camera]
-        for camera, delay in enumerate((0.0, faults.right_delay_s))
-    ]
-    pixels = np.stack(views, axis=1)
+    pixels = _exposed(motion, [times, times + faults.right_delay_s], faults, true_rig, disc)
     if laboratory != Laboratory():
         pixels = _shifted_dots(of_rig, pixels, scene.cameras.image_size, laboratory)
     pixels = pixels + sigma_px * rng.standard_normal(pixels.shape)
@@ -145,17 +139,17 @@ def _rolling(scene: Scene, psi: float, phi: float) -> Motion:
     return lambda times: simulate(model, start, times=np.r_[0.0, times] - STATION).q[1:]  # t = 0 at first frame
 
 
-def _exposed(motion: Motion, times: Array, faults: Faults, rig: StereoRig, disc: Disc) -> Array:
-    """Images of the dots (n, 2, m, 2), averaged over the exposure."""
+def _exposed(motion: Motion, times: Sequence[Array], faults: Faults, rig: StereoRig, disc: Disc) -> Array:
+    """Images of the dots (n, 2, m, 2), averaged over the exposure; times : (n,) of each camera."""
     exposure, share = faults.exposure_s, faults.ellipse_centre_share
     # exact for polynomials of degree seven in time
     nodes, weights = np.polynomial.legendre.leggauss(4) if exposure else (np.zeros(1), np.array([2.0]))
     images = 0.0
     for node, weight in zip(nodes, weights, strict=True):
-        q = motion(times + 0.5 * node * exposure)
-        R, t = rotation_from_euler(*q[:, 3:].T), q[:, :3]
-        seen = np.moveaxis(rig.project(disc.marker_centres_body @ np.swapaxes(R, 1, 2) + t[:, None]), -3, 1)
-        if share:
-            seen = seen + share * ellipse_centre_shift(R, t, rig, disc)
+        q = np.stack([motion(instants + 0.5 * node * exposure) for instants in times])
+        R, t = rotation_from_euler(*np.moveaxis(q[..., 3:], -1, 0)), q[..., :3]
+        seen, _ = marker_pixels(R, t, rig, disc.marker_centres_body)
+        for camera in range(2 if share else 0):
+            seen[:, camera] += share * ellipse_centre_shift(R[camera], t[camera], rig, disc)[:, camera]
         images = images + 0.5 * weight * seen
     return np.asarray(images)
