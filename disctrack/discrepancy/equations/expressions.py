@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from typing import Any, TypeAlias
 
+import numpy as np
 import sympy
 
 from disctrack.errors import AnalysisError
@@ -131,11 +132,8 @@ def smooth(
     def width(argument: sympy.Expr) -> sympy.Symbol:
         return widths.setdefault(argument, sympy.Symbol(f"width_{len(widths)}", positive=True))
 
-    out = expression.replace(sympy.sign, lambda a: sympy.tanh(a / width(a)))
-    out = out.replace(
-        lambda e: isinstance(e, sympy.Heaviside),
-        lambda e: (1 + sympy.tanh(e.args[0] / width(e.args[0]))) / 2,
-    )
+    out = expression.replace(sympy.Heaviside, lambda a, _: (1 + sympy.sign(a)) / 2)
+    out = out.replace(sympy.sign, lambda a: sympy.tanh(a / width(a)))
     return out.replace(
         lambda e: e.is_Pow and e.base.is_Add and e.exp < 1 and (2 * e.exp).is_odd and _vanishes(e.base, moving),
         lambda e: (e.base + width(sympy.sqrt(e.base)) ** 2) ** e.exp,
@@ -147,24 +145,19 @@ def _vanishes(squares: sympy.Expr, moving: AbstractSet[sympy.Symbol]) -> bool:
     return bool(squares.is_nonnegative) and all(term.free_symbols & moving for term in squares.args)
 
 
-def source_of(name: str, inputs: Sequence[sympy.Symbol | tuple[str, Sequence[sympy.Symbol]]],
-              outputs: Sequence[tuple[str, sympy.Expr]], zeroed: Sequence[str]) -> str:  # fmt: skip
-    """Source of a function for numba: scalars and arrays of symbols in, entries of arrays out."""
-    used = set().union(*(e.free_symbols for _, e in outputs)) if outputs else set()
-    arguments, lines = [], []
-    for given in inputs:
-        if isinstance(given, sympy.Symbol):
-            arguments.append(given.name)
-            continue
-        array, symbols = given
-        arguments.append(array)
-        lines += [f"{s.name} = {array}[{i}]" for i, s in enumerate(symbols) if s in used]
-    lines += [f"{array}[:] = 0.0" for array in zeroed]
-    shared, reduced = sympy.cse([e for _, e in outputs], symbols=sympy.numbered_symbols("shared_"))
-    write = sympy.printing.pycode
-    lines += [f"{s.name} = {write(e, fully_qualified_modules=False)}" for s, e in shared]
-    for (target, original), e in zip(outputs, reduced, strict=True):
-        if original != 0:
-            lines.append(f"{target} = {write(e, fully_qualified_modules=False)}")
-    body = "\n    ".join(lines) or "pass"
-    return f"def {name}({', '.join(arguments + list(zeroed))}):\n    {body}\n"
+def source_of(name: str, inputs: Mapping[str, Sequence[sympy.Symbol]], outputs: Mapping[str, Sequence[object]]) -> str:
+    """Source of a function for numba of t and arrays: symbols by the array that holds them, and arrays to be filled."""
+    entries = {
+        f"{array}{list(index)}": e
+        for array, nested in outputs.items()
+        for index, e in np.ndenumerate(np.array(nested, object))
+        if e != 0
+    }
+    used = set().union(*(e.free_symbols for e in entries.values()))
+    lines = [f"{s} = {array}[{i}]" for array, symbols in inputs.items() for i, s in enumerate(symbols) if s in used]
+    lines += [f"{array}[:] = 0.0" for array in outputs]
+    shared, reduced = sympy.cse(list(entries.values()), symbols=sympy.numbered_symbols("shared_"))
+    for target, e in [*shared, *zip(entries, reduced, strict=True)]:
+        lines.append(f"{target} = {sympy.printing.pycode(e, fully_qualified_modules=False)}")
+    body = "\n    ".join(lines)
+    return f"def {name}({', '.join(['t', *inputs, *outputs])}):\n    {body}\n"

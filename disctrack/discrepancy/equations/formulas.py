@@ -117,11 +117,11 @@ class Formulas:
     @cached_property
     def rhs(self) -> Any:
         """Compiled rates with derivatives (`_ode_kernel.RHS`)."""
-        return self._compiled("rates_", self.rates, ("f_", "J_", "P_"))
+        return self._compiled("rates_", self.rates)
 
     @cached_property
     def _observe(self) -> Any:
-        return self._compiled("sensors_", self.observed, ("h_", "H_y", "H_p"))
+        return self._compiled("sensors_", self.observed)
 
     def rates_at(self, s: Samples, p: Array, times: Array, states: Array) -> tuple[Array, Array, Array]:
         """Rates (m, n) at instants (m,) in states (m, n), and their derivatives (m, n, n), (m, n, n_p)."""
@@ -140,18 +140,12 @@ class Formulas:
         kernel.evaluate(function, times, states, p, knots, pieces, values, by_state, by_number)
         return values, by_state, by_number
 
-    def _compiled(self, name: str, formulas: Sequence[sympy.Expr], out: tuple[str, str, str]) -> Any:
-        value, by_state, by_number = out
-        targets = [(f"{value}[{i}]", e) for i, e in enumerate(formulas)]
-        targets += [
-            (f"{by_state}[{i}, {j}]", e.diff(y)) for i, e in enumerate(formulas) for j, y in enumerate(self.states)
-        ]
-        fitted = list(self.fitted.values())
-        for i, e in enumerate(formulas):
-            targets += [(f"{by_number}[{i}, {j}]", self._by_number(e, s)) for j, s in enumerate(fitted)]
-        arrays = [("y_", self.states), ("p_", self.numbers), ("u_", self.inputs), ("u_rates_", self.input_rates)]
-        source = source_of(name, [_t, *arrays], targets, out)
-        return _compiled_source(source, name)
+    def _compiled(self, name: str, formulas: Sequence[sympy.Expr]) -> Any:
+        by_state = [[e.diff(y) for y in self.states] for e in formulas]
+        by_number = [[self._by_number(e, s) for s in self.fitted.values()] for e in formulas]
+        arrays = {"y_": self.states, "p_": self.numbers, "u_": self.inputs, "u_rates_": self.input_rates}
+        outputs = {"f_": formulas, "J_": by_state, "P_": by_number}
+        return _compiled_source(source_of(name, arrays, outputs), name)
 
     def _by_number(self, formula: sympy.Expr, number: sympy.Symbol) -> sympy.Expr:
         """Derivative of a formula by a parameter, which may also be the delay of an input."""
@@ -244,11 +238,7 @@ def _solved(
     for (a, b), mass in masses.items():
         i, j = states.index(a), states.index(b)
         M[i, j] = M[j, i] = mass
-    coupled = [i for i, name in enumerate(states) if any(name in pair for pair in masses)]
-    solved = M.extract(coupled, coupled).LUsolve(sympy.Matrix([forces[i] for i in coupled])) if coupled else []
-    for row, i in enumerate(coupled):
-        forces[i] = solved[row]
-    return forces
+    return list(M.LUsolve(sympy.Matrix(forces))) if masses else forces
 
 
 def _parameter(given: float | Parameter) -> Parameter:
