@@ -168,8 +168,8 @@ class Answer:
         if any(s.stretch for s in stretches) or self.diagnosis.held_out_before is None:
             return []
         residual, _ = self.judged.linearise(self.diagnosis.after.values, [])
-        count = np.array([max(float(np.sum(self.judged.weights[rows])), 1.0) for rows in self.system.rows])
-        left = np.array([float(np.sum(residual[rows] ** 2)) for rows in self.system.rows]) / count
+        count = np.array([max(float(np.sum(self.judged.weights[rows])), 1.0) for rows in self.system.blocks])
+        left = np.array([float(np.sum(residual[rows] ** 2)) for rows in self.system.blocks]) / count
         level = float(np.median(left))
         by_noise = stats.chi2.isf(self.diagnosis.settings.false_alarm / len(left), count) / count
         odd = np.flatnonzero(left > level * np.maximum(ODD**2, by_noise))
@@ -276,7 +276,7 @@ class Answer:
         """Probability of such an autocorrelation in white noise (Ljung-Box, smallest of all channels and stretches)."""
         residual, _ = self.judged.linearise(self.diagnosis.after.values, [])
         p_values = []
-        for rows, s in zip(self.system.rows, self.system.stretches, strict=True):
+        for rows, s in zip(self.system.blocks, self.system.stretches, strict=True):
             for c in range(residual.shape[1]):
                 x = residual[rows, c][np.isfinite(s.data[:, c])]
                 lags = min(LAGS, len(x) // 4)

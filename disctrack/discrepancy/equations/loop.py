@@ -287,19 +287,19 @@ def _prewhiten(system: EquationSystem, diagnosis: Diagnosis, settings: Settings)
         return diagnosis, False, []
     residual, _ = system.linearise(diagnosis.after.values, [])
     present = np.zeros(residual.shape, bool)
-    for rows, s in zip(system.rows, system.stretches, strict=True):
+    for rows, s in zip(system.blocks, system.stretches, strict=True):
         present[rows] = np.isfinite(s.data)
-    coefficients, share = autoregression(residual, present, system.rows)
+    coefficients, share = autoregression(residual, present, system.blocks)
     if not coefficients.any():
         return diagnosis, False, []
     size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
     longest = shooting.longest_stretches(system)
-    lasting = correlation_lag(residual, system.rows) * float(np.median(np.diff(longest[0].time)))
+    lasting = correlation_lag(residual, system.blocks) * float(np.median(np.diff(longest[0].time)))
     shortest_period = min(min(shooting.period(s), _decorrelation_period(s)) for s in longest)
     # slow residuals are errors of the model, although an autoregression can predict them
     as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_period
     as_noise &= size <= NO_SENSOR
-    white = prewhitened(system, system.rows, coefficients, present)
+    white = prewhitened(system, system.blocks, coefficients, present)
     base = fit(white, system.base, diagnosis.before.values) if as_noise else None
     if base is None or not base.converged:
         if diagnosis.verdict != "unexplained":

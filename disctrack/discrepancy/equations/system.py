@@ -54,11 +54,10 @@ class EquationSystem(System):
     def __post_init__(self) -> None:
         lengths = [len(s.time) for s in self.stretches]
         first = np.cumsum([0] + [n + 1 for n in lengths])
-        self.rows = [slice(int(a), int(a) + n) for a, n in zip(first, lengths, strict=False)]
-        self.blocks = self.rows
+        self.blocks = [slice(int(a), int(a) + n) for a, n in zip(first, lengths, strict=False)]
         n, self._w = int(first[-1]), len(self.formulas.channels)
         self.time, self.weights, self.training = np.zeros(n), np.zeros(n), np.zeros(n, bool)
-        for rows, s in zip(self.rows, self.stretches, strict=True):
+        for rows, s in zip(self.blocks, self.stretches, strict=True):
             elapsed = s.time - s.time[0]
             self.time[rows], self.time[rows.stop] = elapsed, elapsed[-1]
             self.weights[rows] = np.isfinite(s.data).sum(axis=1)
@@ -137,7 +136,7 @@ class EquationSystem(System):
         """See System."""
         residual = np.zeros((len(self.time), self._w))
         derivative = np.zeros((len(self.time), self._w, len(names)))
-        for rows, s in zip(self.rows, self.stretches, strict=True):
+        for rows, s in zip(self.blocks, self.stretches, strict=True):
             own = self.names_of(s)
             columns = [i for i, name in enumerate(names) if name in own]
             found = self.predict(values, s, names)
@@ -185,45 +184,40 @@ class EquationSystem(System):
         None where the motion cannot be integrated to the end.
         """
         known = self.names_of(s) if names else {}
-        own = [known[name] for name in names if name in known]
+        own = np.array([known[name] for name in names if name in known], np.int64)
         f = self.formulas
         n, k = len(f.states), len(own)
         p = self.numbers(values, s)
-        z0 = np.zeros(n * (1 + k))
-        z0[:n] = self.start_of(values, s)
-        for c, which in enumerate(own):
-            if which < 0:
-                z0[n * (1 + c) + (-1 - which)] = 1.0
-        columns = np.array([max(which, -1) for which in own], np.int64)
+        z0 = np.zeros((1 + k, n))
+        z0[0] = self.start_of(values, s)
+        initial, fitted = np.flatnonzero(own < 0), own >= 0
+        z0[1 + initial, -1 - own[initial]] = 1.0
         late, by_number = self._lateness(s, p)
         times, which_time = np.unique(s.time + late, return_inverse=True)
         at = which_time.reshape(late.shape).T, np.arange(self._w)  # sensors with a lag show earlier instants
         span = s.time[0], max(float(times[-1]), s.time[0] + 1e-9)
         most = MAX_STEPS if names else min(MAX_STEPS, HARDER * self._steps.get(s.name, MAX_STEPS))
-        out = np.empty((len(times), len(z0)))
+        out = np.empty((len(times), z0.size))
         with np.errstate(all="ignore"):
             steps = kernel.integrate(
-                f.rhs, z0, p, columns, np.array(span), n, *f.driven(s.knots, s.pieces, p), self.sizes, TOLERANCE,
-                most, times, out,
+                f.rhs, z0.ravel(), p, np.maximum(own, -1), np.array(span), n, *f.driven(s.knots, s.pieces, p),
+                self.sizes, TOLERANCE, most, times, out,
             )  # fmt: skip
         self._steps |= {s.name: steps} if names and steps > 0 else {}
-        self.budget.work(abs(steps) * len(z0))
-        self.budget.step(abs(steps) * len(z0))
+        self.budget.work(abs(steps) * z0.size)
+        self.budget.step(abs(steps) * z0.size)
         if steps <= 0:
             return None
         states, moved = out[:, :n], out[:, n:].reshape(len(times), k, n)
         seen, by_state, by_own = f.sensors_at(s, p, times, states)
         derivative = np.einsum("mwn,mkn->mwk", by_state, moved)
-        for j, which in enumerate(own):
-            if which >= 0:
-                derivative[..., j] += by_own[..., which]
+        derivative[..., fitted] += by_own[..., own[fitted]]
         derivative = derivative[at]
         if k and f.is_late:
             with np.errstate(invalid="ignore"):  # a diverging motion has no slope
                 slope = np.einsum("mwn,mn->mw", by_state, f.rates_at(s, p, times, states)[0])[at]
-                for j, which in enumerate(own):
-                    if 0 <= which < by_number.shape[1]:
-                        derivative[..., j] += slope * by_number[:, which].T
+                fitted &= own < by_number.shape[1]
+                derivative[..., fitted] += slope[..., None] * by_number[:, own[fitted]].transpose(2, 0, 1)
         return Prediction(states[at[0][:, 0]], seen[at], derivative)
 
     def _lateness(self, s: Samples, p: Array) -> tuple[Array, Array]:
