@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space, solve_toeplitz, solve_triangular
 from scipy.optimize import minimize
+from scipy.signal import lfilter
 
 from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.elimination import Own, is_linear, projection
@@ -232,18 +233,13 @@ MAX_MEMORY = 24  # largest order of an autoregression
 
 def with_noise(samples: Sequence[Samples]) -> list[Samples]:
     """Runs with sigmas: where none is given, estimated from differences of the channel's data in all runs."""
-    found = list(samples)
-    for c in range(samples[0].data.shape[1]):
-        open_ = [i for i, s in enumerate(found) if np.isnan(s.sigma[:, c]).any()]
-        if not open_:
-            continue
-        values = [found[i].data[:, c] for i in open_]
-        sigma = max(noise_sigma(values, [found[i].time for i in open_]), quantisation(values) / np.sqrt(12.0))
-        for i in open_:
-            columns = found[i].sigma.copy()
-            columns[:, c] = sigma
-            found[i] = replace(found[i], sigma=columns)
-    return found
+    estimated = np.full(samples[0].data.shape[1], np.nan)
+    for c in range(len(estimated)):
+        open_ = [s for s in samples if np.isnan(s.sigma[:, c]).any()]
+        values = [s.data[:, c] for s in open_]
+        if open_:
+            estimated[c] = max(noise_sigma(values, [s.time for s in open_]), quantisation(values) / np.sqrt(12.0))
+    return [replace(s, sigma=np.where(np.isnan(s.sigma), estimated, s.sigma)) for s in samples]
 
 
 def noise_sigma(values: Sequence[Array], times: Sequence[Array] | None = None) -> float:
@@ -304,11 +300,9 @@ def prewhitened(system: System, rows: Sequence[slice], coefficients: Array, pres
 
     def innovations(both: Array) -> Array:
         out = both.copy()
-        for of_stretch in rows:
-            part, new = both[of_stretch], out[of_stretch]
-            for lag in range(1, min(coefficients.shape[1], len(part) - 1) + 1):
-                new[lag:] -= coefficients[:, lag - 1, None] * part[:-lag]
-            new *= present[of_stretch][..., None]
+        for part in rows:
+            for c, own in enumerate(coefficients):
+                out[part, c] = lfilter([1.0, *-own], [1.0], both[part, c], axis=0) * present[part, c, None]
         return out
 
     return Transformed(system, innovations)
