@@ -162,22 +162,18 @@ def _with_guesses(system: EquationSystem, values: Mapping[str, float]) -> Equati
     f = system.formulas
     if not f.along:
         return system
-    passed: list[list[Array]] = []
-    for s, motion in system.predictions(values):
-        if motion is not None:
-            p, u = system.numbers(values, s), system.inputs_of(s)
-            passed.append(f.along_motion(f.along.values(), s.time, motion.states, p, u))
+    passed = [
+        f.along_motion(f.along.values(), s.time, motion.states, system.numbers(values, s), system.inputs_of(s))
+        for s, motion in system.predictions(values)
+        if motion is not None
+    ]
+    shares = (np.arange(SCANNED) + 0.5) / SCANNED
     best: dict[str, tuple[float, dict[str, float]]] = {}
     amounts = [c for c in system.candidates if any(f.owner[n] == c.name for n in f.along)]
     here = no_fit(system.base, values)
-    for share in (np.arange(SCANNED) + 0.5) / SCANNED:
-        tried = {}
-        for i, name in enumerate(f.along):
-            value = float(np.nanquantile(np.concatenate([x[i] for x in passed]), share))
-            bounds = f.declared[name]
-            tried[name] = float(np.clip(value, bounds.lower, bounds.upper))
-        if not np.isfinite(list(tried.values())).all():
-            continue
+    for along in np.nanquantile(np.concatenate(passed, axis=1), shares, axis=1):
+        bounds = [(f.declared[name].lower, f.declared[name].upper) for name in f.along]
+        tried = dict(zip(f.along, np.clip(along, *np.transpose(bounds)).tolist(), strict=True))
         there = replace(system, guesses=tried)
         if not np.isfinite(there.linearise(values, [n for c in amounts for n in c.names])[1]).all():
             continue

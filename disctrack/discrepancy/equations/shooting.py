@@ -26,7 +26,6 @@ LOST = 0.3  # rms of the residuals over that of the signal, above which the mode
 LOOSE = 0.6  # the same where it does not follow short stretches, but whole runs from a known initial state
 _WINDOWS = (8, 12, 18, 27, 40, 60, 90, 135, 200)  # samples of the local polynomial
 _ATTEMPTS = 100  # evaluations of a trust-region fit
-_NOWHERE = 1e8  # residual where there is no prediction
 _INSTANTS = 24  # at which the sizes of the states are estimated
 
 
@@ -128,19 +127,16 @@ def scales(system: EquationSystem, values: Mapping[str, float]) -> dict[str, flo
     """Natural scale of every parameter: where its effect is as large as its equation, or a tenth of a signal (rms)."""
     f = system.formulas
     n_fitted = len(f.fitted)
-    own, acting = np.zeros(len(f.states)), np.zeros((len(f.states), n_fitted))
-    shown, seen = np.zeros(len(f.channels)), np.zeros((len(f.channels), n_fitted))
+    size, acting = 0.0, np.zeros((len(f.states) + len(f.channels), n_fitted))
     for s, motion in system.predictions(values):
         p = system.numbers(values, s)
         states = np.zeros((len(s.time), len(f.states))) if motion is None else motion.states
         rates, _, by_number = f.rates_at(s, p, s.time, states)
-        h, _, H_p = f.sensors_at(s, p, s.time, states)
-        own += np.sum(rates**2, axis=0)
-        acting += np.sum(by_number[..., :n_fitted] ** 2, axis=0)
-        shown += np.sum((h - h.mean(axis=0)) ** 2, axis=0)
-        seen += np.sum(H_p[..., :n_fitted] ** 2, axis=0)
+        shown, _, seen = f.sensors_at(s, p, s.time, states)
+        size += np.sum(np.hstack([rates, 0.1 * (shown - shown.mean(axis=0))]) ** 2, axis=0)[:, None]
+        acting += np.sum(np.hstack([by_number, seen])[..., :n_fitted] ** 2, axis=0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        sizes = np.concatenate([np.sqrt(own[:, None] / acting), 0.1 * np.sqrt(shown[:, None] / seen)])
+        sizes = np.sqrt(size / acting)
     usable = np.where(np.isfinite(sizes) & (sizes > 0), sizes, np.inf).min(axis=0)
     return {name: float(size) for name, size in zip(f.fitted, usable, strict=True) if np.isfinite(size)}
 
@@ -245,8 +241,7 @@ def trust_region(system: System, quantities: Sequence[Quantity], declared: Mappi
         return dict(declared) | dict(zip(names, x.tolist(), strict=True))
 
     def residual(x: Array) -> Array:
-        rows = np.concatenate([system.linearise(at(x), [])[0].ravel(), prior_rows(quantities, at(x))[0]])
-        return np.nan_to_num(rows, nan=_NOWHERE, posinf=_NOWHERE, neginf=-_NOWHERE)
+        return np.concatenate([system.linearise(at(x), [])[0].ravel(), prior_rows(quantities, at(x))[0]])
 
     def jacobian(x: Array) -> Array:
         derivative = system.linearise(at(x), names)[1].reshape(-1, len(names))

@@ -108,11 +108,11 @@ def test_a_free_run_is_as_probable_as_by_one_problem(answer):
 def test_of_a_run_that_is_kept_back_what_its_own_numbers_cannot_move_is_judged(answer):
     """Against contrasts by SciPy's null space; how they are turned among themselves does not matter."""
     system, after = answer.system, answer.diagnosis.after
-    back = system.rows[-1]
+    back = system.blocks[-1]
     rows = system.weights > 0
     rows[back] = False
     held = held_out(system, after.quantities, after.values, rows)
-    own = [q.name for q in after.quantities if q.slot and q.block == len(system.rows) - 1]
+    own = [q.name for q in after.quantities if q.slot and q.block == len(system.blocks) - 1]
     b = f"b[{system.stretches[-1].run}]"
     free = [i for i, name in enumerate(own) if name != b]  # this one has a prior
     names = list(held.train.shared)
@@ -133,7 +133,7 @@ def test_a_number_that_nothing_in_its_run_shows_stays_as_it_is(answer):
     """The friction of a run at rest: no variance, no step, and nothing else is disturbed."""
     system = answer.system
     seen = np.ones(len(system.time), bool)
-    seen[system.rows[2]] = False
+    seen[system.blocks[2]] = False
     fitted = fit(subset(system, seen), system.base, answer.diagnosis.after.values)
     assert fitted.converged
     assert fitted.values["state.x[swing 2]"] == answer.values["state.x[swing 2]"]
@@ -161,7 +161,7 @@ def test_a_run_that_is_kept_back_as_a_whole_judges(rng):
     runs = [*(replace(run, fit_until=np.inf) for run in others), replace(last, fit_until=0)]
     answer = diagnose(SWINGS, runs, OFFERED)
     assert answer.found == ("coulomb_v",)
-    held, back = answer.diagnosis.held_out_after, answer.system.rows[-1]
+    held, back = answer.diagnosis.held_out_after, answer.system.blocks[-1]
     assert held.test_rows[back].all()
     assert held.test_rows.sum() == back.stop - back.start
     assert answer.diagnosis.found[0].held_out_gain > 20
