@@ -56,13 +56,10 @@ def clock_jumps(trajectory: Trajectory) -> dict[int, int]:
 
 def _cuts(seen: NDArray[np.bool_]) -> Iterator[tuple[int, NDArray[np.intp]]]:
     """Numbers of frames without a pose at a cut, and the rows that follow SIDE poses and precede such a cut."""
-    whole = np.convolve(seen, np.ones(SIDE), "valid") == SIDE  # rows i .. i + SIDE - 1
-    for gap in range(MOST_LOST + 1):
-        n = len(seen) - 2 * SIDE - gap + 1
-        if n <= 0:
-            return
-        lost = np.convolve(seen, np.ones(gap), "valid")[SIDE : SIDE + n] == 0 if gap else np.ones(n, bool)
-        first = np.flatnonzero(whole[:n] & whole[SIDE + gap : SIDE + gap + n] & lost)
+    for gap in range(min(MOST_LOST, len(seen) - 2 * SIDE) + 1):
+        around = np.lib.stride_tricks.sliding_window_view(seen, 2 * SIDE + gap)
+        lost = ~around[:, SIDE : SIDE + gap].any(axis=1)
+        first = np.flatnonzero(around[:, :SIDE].all(axis=1) & lost & around[:, SIDE + gap :].all(axis=1))
         if len(first):
             yield gap, first + SIDE
 
