@@ -34,6 +34,12 @@ def image_of(points_world: Array, view: View) -> Array:
     return project(points_world @ view.R_camera_world.T + view.t_camera_world, view.camera)
 
 
+def all_inside(points_world: Array, rig: StereoRig, border_px: float) -> bool:
+    """Do all points (n, 3) [m] lie within both images, farther than this from their borders?"""
+    pixels, size = rig.project(points_world), np.array([camera.image_size for camera in rig.cameras])[:, None]
+    return bool(np.all((pixels > border_px) & (pixels < size - 1 - border_px)))
+
+
 def rig_of(scene: Scene) -> StereoRig:
     """The rig during its calibration, with the table as world."""
     rng = np.random.default_rng([scene.seed, 1])
@@ -98,11 +104,6 @@ def _in_view(R_world_board: Array, t_world_board: Array, rig: StereoRig, scene: 
     board = scene.board
     corners = np.array([[x, y, 0.0] for x in (-1, board.inner_corners[0]) for y in (-1, board.inner_corners[1])])
     points = corners * board.square_mm * 1e-3 @ R_world_board.T + t_world_board
-    for view in views_of(rig):
-        pixels = image_of(points, view)
-        if np.any(pixels < 8) or np.any(pixels > np.array(view.camera.image_size) - 9):
-            return False
-        eye = view.centre - points.mean(axis=0)
-        if eye @ R_world_board[:, 2] < np.cos(np.radians(65)) * np.linalg.norm(eye):
-            return False
-    return True
+    eyes = np.array([view.centre for view in views_of(rig)]) - points.mean(axis=0)
+    steep = eyes @ R_world_board[:, 2] >= np.cos(np.radians(65)) * np.linalg.norm(eyes, axis=1)
+    return all_inside(points, rig, 8) and bool(steep.all())

@@ -18,7 +18,7 @@ from disctrack.disc import Disc
 from disctrack.errors import SceneError
 from disctrack.frames import CAMERAS, rotation_from_euler
 from disctrack.recording.declaration import Recording, read_recording
-from disctrack.synthetic.cameras import rig_of
+from disctrack.synthetic.cameras import all_inside, rig_of
 from disctrack.synthetic.description import GlareSettings, Scene
 from disctrack.synthetic.recording import Truth, write_recording
 from disctrack.track.follow.tracking import Measurement, Taken, track
@@ -197,18 +197,11 @@ def _pose(stratum: Array, rig: StereoRig, disc: Disc, middle: Array, rng: np.ran
         reach = FIELD_RADIUS * np.sqrt(rng.uniform()) * (1 - attempt / 500)
         x, y = middle + reach * np.array([np.cos(direction), np.sin(direction)])
         q = np.array([x, y, disc.resting_height(theta), psi, theta, phi])
-        if _inside(q, rig, disc):
+        if all_inside(disc.marker_centres_body @ rotation_from_euler(*q[3:]).T + q[:3], rig, BORDER_PX):
             return q
     raise SceneError(
         "validation: no place found where all dots lie in both images; widen the field (rig.mm_per_px, image_size)"
     )
-
-
-def _inside(q: Array, rig: StereoRig, disc: Disc) -> bool:
-    R = rotation_from_euler(*q[3:])
-    pixels = rig.project(disc.marker_centres_body @ R.T + q[:3])
-    size = np.array([camera.image_size for camera in rig.cameras])[:, None]
-    return bool(np.all((pixels > BORDER_PX) & (pixels < size - 1 - BORDER_PX)))
 
 
 def cameras_in_sight(q: Array, rig: StereoRig, disc: Disc) -> NDArray[np.int64]:
