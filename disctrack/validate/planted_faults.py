@@ -173,18 +173,18 @@ def _in_sigmas(trajectory: Trajectory | None, q: Array) -> float:
 
 def plantings(ground: Ground) -> dict[str, Planting]:
     """All faults that can be planted into such a recording, by name; of those of a camera or a dot, only one."""
-    others, found = "right" if ground.scene is None else "left", {}
-    recording = read_recording(ground.recording)
+    scene, recording, found = ground.scene, read_recording(ground.recording), {}
+    others = "right" if scene is None else "left"
     for fault in faults_of(recording.disc):
         alike = fault.name.startswith((others, "misprint")) and fault.name != "misprint_0"
         declarable = not fault.in_images and fault.key != "right_delay_s"  # equivalent to a wrong declaration
-        if not fault.named_by or alike or (ground.scene is None and not declarable):
+        if not fault.named_by or alike or (scene is None and not declarable):
             continue
-        change = _declared_wrong if ground.scene is None else _rendered
+        change: Change = partial(_rendered, fault, scene) if scene else partial(_declared_wrong, fault, recording.disc)
         sizes = [TYPICAL_STEPS * fault.step * size for size in SIZES]
         if fault.in_images:  # the square of an exposure, which is shorter than the period
             sizes = [size for size in sizes if size * recording.frame_rate**2 < 1]
-        found[fault.name] = Planting(sizes, fault.unit, partial(change, fault, ground), fault.named_by)
+        found[fault.name] = Planting(sizes, fault.unit, change, fault.named_by)
     return found | CHANGES
 
 
@@ -194,18 +194,15 @@ def _with(fault: Fault, size: float, disc: Disc, rate: float = 1.0) -> Faults:
     return scene_faults(disc, values, rate)
 
 
-def _rendered(fault: Fault, ground: Ground, folder: Path, tree: Tree, size: float) -> Array:
-    scene = ground.scene
-    assert scene is not None
+def _rendered(fault: Fault, scene: Scene, folder: Path, tree: Tree, size: float) -> Array:
     wrong = _with(fault, size, scene.declared_disc, scene.cameras.frame_rate_hz)
     shutil.rmtree(folder)
     return write_recording(folder, scene.changed(faults=wrong, board={"n_views": 1})).q
 
 
-def _declared_wrong(fault: Fault, ground: Ground, folder: Path, tree: Tree, size: float) -> None:
+def _declared_wrong(fault: Fault, disc: Disc, folder: Path, tree: Tree, size: float) -> None:
     """Change the declaration and the rig so that the unchanged images have the fault."""
-    disc, rig = read_recording(ground.recording).disc, read_rig(tree["calibration"]["rig"])
-    wrong = _with(fault, -size, disc)
+    rig, wrong = read_rig(tree["calibration"]["rig"]), _with(fault, -size, disc)
     tree["markers"]["centres_mm"] = (1e3 * centres_with(wrong, disc)[:, :2]).tolist()
     tree["disc"]["thickness_mm"] = 2e3 * float(disc.half_thickness + 1e-3 * wrong.pattern_height_mm)
     tree["cameras"]["frame_rate_hz"] *= wrong.frame_rate_hz or 1.0
