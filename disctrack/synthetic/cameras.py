@@ -105,5 +105,5 @@ def _in_view(R_world_board: Array, t_world_board: Array, rig: StereoRig, scene: 
     corners = np.array([[x, y, 0.0] for x in (-1, board.inner_corners[0]) for y in (-1, board.inner_corners[1])])
     points = corners * board.square_mm * 1e-3 @ R_world_board.T + t_world_board
     eyes = np.array([view.centre for view in views_of(rig)]) - points.mean(axis=0)
-    steep = eyes @ R_world_board[:, 2] >= np.cos(np.radians(65)) * np.linalg.norm(eyes, axis=1)
-    return all_inside(points, rig, 8) and bool(steep.all())
+    facing = eyes @ R_world_board[:, 2] >= np.cos(np.radians(65)) * np.linalg.norm(eyes, axis=1)
+    return all_inside(points, rig, 8) and bool(facing.all())
