@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 from calibration.cameras.camera import N_RIG, StereoRig, by_turning
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.least_squares import normal_of_rows
+from disctrack.analyse.quantities import SIGMAS
 from disctrack.disc import Disc
 from disctrack.faults.dots import marker_pixels
 from disctrack.track import _pose_kernel as kernel
 
 MIN_DOTS = 3  # six unknowns, two coordinates per dot
-# A dot is an outlier if chi-square decreases without it by more than twice this, times the reduced chi-square of the
-# other dots: by chance once in 3e5 dots.
-OUTLIER_CHI_SQUARE = 25.0
 TOLERANCE = 1e-3  # standard deviations: the Gauss-Newton step at which a pose has converged
 
 
@@ -182,12 +180,15 @@ def fit_poses(seen: DotsInFrames, *, reject_outliers: bool = True, with_sensitiv
 def _strike_worst_dot(residual: Array, JW: Array, used: Mask, rows: NDArray[np.intp]) -> NDArray[np.intp]:
     """Remove the worst outlier of each of the rows from `used`; returns the rows that must be fitted again.
 
+    A dot is an outlier if chi-square decreases without it by more than 2 SIGMAS^2, times the reduced chi-square of the
+    other dots: by chance once in 3e5 dots.
+
     residual (n, 2, m, 2), JW (n, 2, m, 2, 6): whitened, zeros for dots that are not used
     """
     count = used[rows].sum((1, 2))
     chi_square = np.sum(residual[rows] ** 2, axis=(1, 2, 3))
     # the decrease by one dot is at most chi-square itself: no other frame can have an outlier
-    far = np.flatnonzero((chi_square > 2 * OUTLIER_CHI_SQUARE) & (count > MIN_DOTS + 1))
+    far = np.flatnonzero((chi_square > 2 * SIGMAS**2) & (count > MIN_DOTS + 1))
     if not len(far):
         return rows[far]
     rows, chi_square, count = rows[far], chi_square[far], count[far]
@@ -205,6 +206,6 @@ def _strike_worst_dot(residual: Array, JW: Array, used: Mask, rows: NDArray[np.i
     # relative to the other dots of the frame: a small error of the rig must not remove good dots, and a pose must not
     # depend on the other frames in the call
     usual = np.maximum(1.0, (chi_square - largest) / np.maximum(2 * count - 8, 1))
-    struck = possible & (largest > 2 * OUTLIER_CHI_SQUARE * usual)
+    struck = possible & (largest > 2 * SIGMAS**2 * usual)
     used.reshape(len(used), -1)[rows[struck], worst[struck]] = False
     return rows[struck]

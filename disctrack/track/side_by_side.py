@@ -8,6 +8,7 @@ from calibration.kit.arrays import Mask
 AT_ONCE = 512  # frames, whose temporary arrays are many times as large as the result, and fit into a core's cache
 SHARED_FRAMES = 400  # at most, to estimate what all frames share: more frames repeat it
 MIN_FRAMES = 20  # to estimate what frames share, or how they scatter
+SURE = 3.0  # sigmas of an estimate of what frames share, below which it is not used
 FEW = 4  # consecutive frames that indicate a lasting fault
 
 

@@ -19,13 +19,13 @@ from disctrack.analyse.declaration import SIDE_TOLERANCE
 from disctrack.disc import Disc
 from disctrack.faults.dots import marker_pixels
 from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_vector
-from disctrack.track.pose import DotsInFrames, fit_poses
+from disctrack.track.pose import MIN_DOTS, DotsInFrames, fit_poses
 
 MAX_BLOBS = 24
 EPIPOLAR_PX = 4.0  # centroids of blobs err by up to 1 px under glare, the rig by much less
 INLIER_DIAMETERS = 0.35  # largest distance between a blob and its dot, in diameters of the dot
-MIN_EXPLAINED = 4
-BLOB_PX = 0.5  # standard deviation of a blob's centroid under uneven light
+# Standard deviation of a blob's centroid under uneven light; beyond twice this, cameras or clocks contradict each other
+BLOB_PX = 0.5
 CANDIDATES = 40  # poses that are refined
 
 Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]
@@ -200,7 +200,7 @@ def rigid_motions(body: Array, world: Array) -> tuple[Array, Array]:
 
 
 def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc: Disc) -> list[Pose]:
-    if len(blobs) < MIN_EXPLAINED:
+    if len(blobs) <= MIN_DOTS:
         return []
     blobs = blobs[:9]
     rays = normalise(blobs, rig.cameras[camera])
@@ -224,7 +224,7 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
         score = np.append(score, _score(_gaps(turned, placed, blobs, camera, rig, disc).min(axis=2)))
         if score.max(initial=0.0) > len(centres) - 1.0:
             break  # all dots are explained to the accuracy of blobs: no other triple does better
-    good = score > MIN_EXPLAINED - 0.5
+    good = score > MIN_DOTS + 0.5
     return _best(R[good], t[good], score[good])
 
 
@@ -254,6 +254,6 @@ def _best_explanation(
     if rig.world_is_table:
         gap = np.abs(t[:, 2] - disc.resting_height(euler_from_rotation(R)[:, 1]))
         cost += 0.5 * np.minimum(gap, 5e-3) / disc.half_thickness
-    cost = np.where((explained >= MIN_EXPLAINED) & (rms < 2.5) & fits.converged, cost, np.inf)
+    cost = np.where((explained > MIN_DOTS) & (rms < 2.5) & fits.converged, cost, np.inf)
     k = int(np.argmin(cost))
     return ((R[k], t[k]), int(explained[k])) if np.isfinite(cost[k]) else (None, 0)

@@ -26,7 +26,7 @@ from disctrack.trajectory import FrameStatus, MarkerStatus
 
 # rms residual of a pair above which the disc is lost: a tenth of a dot, ten times that of a poor rig
 MAX_PREDICTION_RMS_PX = 2.0
-NOISE_FRAMES = 12  # from which blur and noise are measured
+SAMPLE = 12  # pairs from which blur, noise and stuck pixels are measured, and the cause if the disc is not found
 MIN_TO_BEGIN = 5  # dot images that a newly found pose needs: three fit any pose
 # Frames over which the last motion is extrapolated, each at the cost of one fit of the dots; also the longest wait
 # between searches, each of which costs as much as some 600 fits
@@ -269,7 +269,7 @@ def _nearest_alike(pose: Pose, following: Pose, disc: Disc) -> Pose:
 
 def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, heading: Heading) -> None:
     """Measure noise and blur of the cameras; `measured` stays False if the disc is not seen."""
-    n, saturated = min(NOISE_FRAMES, len(images)), list(follower.saturated)
+    n, saturated = min(SAMPLE, len(images)), list(follower.saturated)
     edges = [Edge(noise=rough_noise(images[seen.argmax(), camera])) for camera, seen in enumerate(readable[:n].T)]
     # the second time with the blur and the residual noise of the first
     for limits in (kernels.Limits(blur=np.inf, share=MOST_USUAL), kernels.Limits()):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import Array32, robust_sigma
 from calibration.kit.grey_levels import level_step
+from disctrack.analyse.quantities import SIGMAS
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader
 
@@ -22,9 +23,8 @@ Pair = tuple[NDArray, NDArray]
 
 STRIDE = 16  # frames between two samples; irregular by up to 5, so that no period of the disc is in step with them
 MARGIN = 0.25  # [s] kept before the last frame at rest: a disc that tips over starts too slowly to be seen
-THRESHOLD = 5.0  # sigmas; of 65 000 pixels 0.04 exceed it by chance
 MIN_PIXELS = 12  # in the image of half size: fewer are hot pixels or an insect
-VIBRATION_PX = 0.03  # by a fan; motion is detected from THRESHOLD times this displacement on
+VIBRATION_PX = 0.03  # by a fan; motion is detected from SIGMAS times this displacement on
 NOISE_BINS = 16
 
 
@@ -51,7 +51,7 @@ def still_scene(first: NDArray, second: NDArray) -> Callable[[NDArray], bool]:
         now = _reduced(image)
         gain = float(np.vdot(centred, now)) / square
         z = np.abs(now - float(now.mean()) - gain * centred) * weight
-        return int(np.count_nonzero(z > THRESHOLD)) >= MIN_PIXELS
+        return int(np.count_nonzero(z > SIGMAS)) >= MIN_PIXELS
 
     return differs
 

@@ -20,9 +20,10 @@ from disctrack.disc import MA_2014, Disc, symmetry_order
 from disctrack.errors import TrackingError
 from disctrack.findings import Finding, Kind, Severity, Subject, in_doubt
 from disctrack.recording.readers.blocks import PairBlock
-from disctrack.track.follow.following import Follower, Heading, Tables, empty_tables, follow_block, maps_of, run
+from disctrack.track.dots.acquisition import BLOB_PX
+from disctrack.track.follow.following import SAMPLE, Follower, Heading, Tables, empty_tables, follow_block, maps_of, run
 from disctrack.track.judge.cameras import frames_ahead, left_out
-from disctrack.track.judge.disc_not_seen import MEETING_PX, why_not_seen
+from disctrack.track.judge.disc_not_seen import why_not_seen
 from disctrack.track.judge.doubts import MOVED
 from disctrack.track.pose import DotsInFrames, fit_poses
 from disctrack.track.refine.assembly import Measurement, Taken, TrackingSettings, assemble
@@ -35,7 +36,6 @@ SHORTEST_SPLIT = 1000  # pairs; shorter stretches do not repay the search for th
 LOOK_AGAIN = 60e-6
 DECLARED = (Kind.DOTS_MISPLACED, Kind.TABLE_DISAGREES)  # findings about declared numbers, not about images
 APART, PAIRED = 10, 60  # frames: contradictory ones in a row that start a test for dropped frames; length of the test
-PAIRS_TRIED = 12  # for the search of stuck pixels, and of the cause if the disc is not found
 MAX_EDGE_TURN = np.radians(25.0)  # largest error of the prediction across the edge of two stretches
 
 
@@ -116,7 +116,7 @@ def _check_dots(disc: Disc) -> None:
 
 def _dropped(tracking: Measurement, read_blocks: ReadBlocks, pairs: range, begin: Follower) -> tuple[Finding, ...]:
     """Images left out by one camera, from the pairing that fits the frames after the gap."""
-    apart = _apart(tracking) | (max(tracking.details["systematic_px"]) > MEETING_PX / 2)
+    apart = _apart(tracking) | (max(tracking.details["systematic_px"]) > BLOB_PX)
     long = stretches(apart, APART)
     if not len(long) or Kind.DELAY in {finding.kind for finding in tracking.trajectory.findings}:
         return ()
@@ -150,7 +150,7 @@ def _conflicts(tracking: Measurement, noticed: tuple[Finding, ...], read_blocks:
     kinds = {finding.kind for finding in noticed}
     status = tracking.trajectory.frame_status
     contradicted = Kind.ONE_SIDED in kinds or 2 * np.sum(status == FrameStatus.CONTRADICTED) > len(status)
-    far = _faulty(noticed) and max(tracking.details["systematic_px"]) > MEETING_PX
+    far = _faulty(noticed) and max(tracking.details["systematic_px"]) > 2 * BLOB_PX
     if not (contradicted or far) or Kind.DROPPED_FRAMES in kinds:  # dropped frames explain the contradiction
         return _some(read_blocks, pairs[:0])
     rows = np.flatnonzero(_apart(tracking) | (far & (status == FrameStatus.MEASURED)))
@@ -207,7 +207,7 @@ def _followed(
 
 def _some(read_blocks: ReadBlocks, pairs: range) -> NDArray:
     """(k, 2, height, width) images of some of the pairs, evenly spread, that can be read."""
-    chosen = evenly(np.array(pairs), PAIRS_TRIED).tolist()
+    chosen = evenly(np.array(pairs), SAMPLE).tolist()
     found = [block.images[block.readable.all(axis=1)].copy() for i in chosen for block in read_blocks(i, i + 1)]
     return np.concatenate(found) if found else np.zeros((0, 2, 1, 1), np.uint8)
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, WORLD_SHIFT, WORLD_TURN, StereoRig
 from calibration.kit.arrays import Array, Mask
+from disctrack.analyse.quantities import SIGMAS
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS, vector_from_rotation
 from disctrack.numbers import Measured
@@ -30,7 +31,6 @@ from disctrack.track.side_by_side import FEW, SHARED_FRAMES, evenly
 # part of it: the residuals of a moved camera resemble those of a delay a little
 LATE, HARDLY = 0.9, 0.3
 STRETCHES = 20
-SURE = 5.0  # sigmas of the difference before and after; a linear drift, its own scatter, reaches 7
 
 
 def left_out(ahead: int, pairs: range, first: int) -> Finding:
@@ -113,7 +113,7 @@ def camera_motion(seen: DotsInFrames, fits: PoseFits, pairs: range) -> tuple[Arr
     # decrease of chi-square by a constant rotation, and the further decrease if it varies; excess over the noise
     constant = (weight @ angle) ** 2 / weight.sum()
     explained, misfit = weight @ angle**2 - constant, sum(squares) - fits.degrees_of_freedom[rows].sum()
-    if significance < SURE or explained < HARDLY * (misfit - constant):
+    if significance < SIGMAS or explained < HARDLY * (misfit - constant):
         return np.zeros((6, 6)), ()
     turn, frame = float(np.ptp(angle)), pairs[parts[first][0]]
     by_turn = turn * fits.sensitivity @ either
@@ -137,7 +137,7 @@ def _turns(rig: StereoRig) -> Array:
 
 
 def _difference(values: Array, cut: int) -> float:
-    """Difference of the means before and after the cut, in sigmas."""
+    """Difference of the means before and after the cut, in sigmas; a linear drift, its own scatter, reaches 7."""
     before, after = values[:cut], values[cut:]
     square = len(before) * before.var() + len(after) * after.var()
     variance = square / (len(values) - 2) * (1 / len(before) + 1 / len(after))

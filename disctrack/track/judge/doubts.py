@@ -17,11 +17,11 @@ from disctrack.track.follow.following import Follower
 from disctrack.track.judge.cameras import HARDLY, LATE, delay_of_right
 from disctrack.track.pose import DotsInFrames
 from disctrack.track.refine.scatter import Scatter
-from disctrack.track.refine.table_contact import FROM_SIGMAS, TableFromDisc
-from disctrack.track.side_by_side import FEW, stretches
+from disctrack.track.refine.self_calibration import DOT_SIGMA
+from disctrack.track.refine.table_contact import TableFromDisc
+from disctrack.track.side_by_side import FEW, SURE, stretches
 from disctrack.trajectory import FrameStatus, Trajectory
 
-MISPLACED_MM = 0.15  # a printer that stretches a sheet by 0.5 % moves a dot 26 mm off the centre by 0.13 mm
 FAULTY = 2.0  # times the variance of the noise, above which scatter has another cause
 ORDINARY_PX = 0.03  # rms of systematic misfit that good lenses have beyond their polynomial
 HOPELESS = 25.0  # times the variance of the noise, above which no result is right within its sigmas
@@ -82,7 +82,7 @@ def off_the_table(trajectory: Trajectory, severity: Severity = Severity.WARNING)
 def misplaced_dots(declared: Disc, found: Array) -> tuple[Finding, ...]:
     """Dots whose positions (m, 3) [m] differ from the declared ones by more than a printer errs; what to declare."""
     away = 1e3 * np.linalg.norm(found - declared.marker_centres_body, axis=1)
-    far = np.flatnonzero(away > MISPLACED_MM)
+    far = np.flatnonzero(away > 1e3 * SURE * DOT_SIGMA)
     if not len(far):
         return ()
     named = ", ".join(f"dot {dot} by {away[dot]:.2f} mm" for dot in far)
@@ -186,7 +186,7 @@ def _table_disagrees(table: TableFromDisc | None, trajectory: Trajectory) -> tup
     """Disagreement of board and disc about the table beyond their tolerances; else a disc that is not on the table."""
     apart = table is not None and abs(table.plane[0]) > NO_TOLERANCE
     severity = Severity.DOUBT if apart else Severity.WARNING
-    if table is None or table.probability >= scipy.special.erfc(FROM_SIGMAS / np.sqrt(2)):
+    if table is None or table.probability >= scipy.special.erfc(SURE / np.sqrt(2)):
         return off_the_table(trajectory, severity)
     text = (
         f"the disc's lowest point does not roll on the board's table: {table.sentence}. They differ by more than "

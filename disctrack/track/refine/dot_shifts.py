@@ -45,10 +45,9 @@ from disctrack.analyse.quantities import SIGMAS
 from disctrack.findings import Finding, Kind, Severity
 from disctrack.frames import CAMERAS
 from disctrack.track.dots.template import AROUND, Edge, axes_of, biases
-from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly, parts
+from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, SURE, evenly, parts
 
 PARTS = 10  # stretches of the recording for the jackknife, as residuals are autocorrelated
-SURE = 3.0  # sigmas of T^2, below which the exposure is set to 0
 APPROXIMATE = 0.1  # relative error of T^2, as a single blur represents an edge that is blurred unevenly
 DEGREE = 4  # of the polynomial: glare as wide as the disc's path
 # Prior standard deviations of one term of the polynomial over the dots' path, in units of that of the contrast. The one

@@ -24,7 +24,7 @@ from disctrack.analyse.derivatives import CHANNELS
 from disctrack.track.judge.outlier_tests import differences, sums_over_time
 from disctrack.track.pose import DotsInFrames, PoseFits, whitening
 from disctrack.track.refine.self_calibration import DOT_SIGMA, AsBuilt, fit_shared
-from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly
+from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, SURE, evenly
 
 LEAST_NOISE = 0.25  # of the residual variance of the templates: the rest may be fixed-pattern noise
 # Prior sigmas of the errors of a camera: far larger than in any useful rig, and small enough to bound what the dots do
@@ -89,7 +89,7 @@ def split_scatter(fits: PoseFits, markers_covariance_px2: Array, by_free_cameras
     noise = max(noise, LEAST_NOISE)
     # three sigmas of chance: both are means over n frames, but overlapping triples have half the information
     freedom = float(np.sum(fits.degrees_of_freedom[fits.degrees_of_freedom >= 6]))
-    by_chance = 3.0 * noise * np.sqrt(6.0 / max(freedom, 1.0))
+    by_chance = SURE * noise * np.sqrt(6.0 / max(freedom, 1.0))
     systematic = whole - noise if whole - noise > by_chance else 0.0
     systematic_px = 0.0, 0.0
     if systematic:
@@ -150,7 +150,7 @@ def scatter_of_poses(fits: PoseFits) -> tuple[Array, Array, Array]:
         found[i], sigma[i] = kept[part].mean(), np.sqrt(2 * WORTH / (len(square) * len(part)))
         excess = found[i] - 1.0
         # no excess below three sigmas, all of it far above
-        factor[part] = 1.0 + max(excess - (3.0 * sigma[i]) ** 2 / excess, 0.0) if excess > 0 else 1.0
+        factor[part] = 1.0 + max(excess - (SURE * sigma[i]) ** 2 / excess, 0.0) if excess > 0 else 1.0
     return found, sigma, factor
 
 

@@ -34,7 +34,7 @@ from disctrack.analyse.derivatives import K
 from disctrack.disc import Disc
 from disctrack.numbers import measured
 from disctrack.track.pose import PoseFits
-from disctrack.track.side_by_side import parts
+from disctrack.track.side_by_side import SURE, parts
 
 OF_PATTERN = "where the dots are on the disc"
 DISAGREEMENT = "board and disc disagree about the table"
@@ -45,7 +45,6 @@ MAX_SCATTER = 30e-6  # [m] of the gaps about their plane: beyond, the disc jumps
 NOISY = 6.0  # the same limit relative to the predicted scatter of the poses; the larger one applies
 # Standard deviations [m] of radius and thickness if not declared: 0.02 %, and that of a micrometer gauge
 ASSUMED_RADIUS, ASSUMED_THICKNESS = 7.5e-6, 3e-6
-FROM_SIGMAS = 3.0  # combined sigmas above which board and disc disagree
 STEEP = 0.1  # slope above which the plane is not the table: the board of the declared view lay elsewhere
 PLACES = 6.0  # number of independent values of the cameras' smooth errors in a whole turn of the contact
 
@@ -81,7 +80,7 @@ class TableFromDisc:
         theta : (n,) as for `off_centre`. Above this distance board and disc disagree.
         """
         fields = {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in vars(self).items()}
-        lean = FROM_SIGMAS * np.hypot(self.sigma, self.board_sigma)[1:].max()
+        lean = SURE * np.hypot(self.sigma, self.board_sigma)[1:].max()
         least = float(disc.radius * lean / np.sin(np.nanmedian(theta)))
         return {**fields, "least_off_centre": least, "told": self.sentence}
 
@@ -115,7 +114,7 @@ def table_from_disc(
         V, board = noise + (by_disc * of_dots**2) @ by_disc.T, H @ rig.covariance @ H.T
     # a difference above three combined sigmas is attributed to the board: it bends, and lies on dust
     allowed = np.diag(board + V)
-    excess = np.where(plane**2 > FROM_SIGMAS**2 * allowed, plane**2 - allowed, 0.0)
+    excess = np.where(plane**2 > SURE**2 * allowed, plane**2 - allowed, 0.0)
     more = board + np.diag(excess)
     # weight of the plane by the disc, as these cameras see it: common errors cancel
     gain = more @ np.linalg.inv(more + V) if source == "both" else np.eye(3) * (source == "disc")

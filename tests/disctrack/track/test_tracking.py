@@ -15,7 +15,8 @@ from disctrack.errors import RecordingError, TrackingError
 from disctrack.findings import Kind
 from disctrack.recording.readers.blocks import PairBlock
 from disctrack.track.dots.template import dot_centres
-from disctrack.track.follow.tracking import PAIRS_TRIED, Taken, _as_one_sensor, stretch_edges, track
+from disctrack.track.follow.following import SAMPLE
+from disctrack.track.follow.tracking import Taken, _as_one_sensor, stretch_edges, track
 from disctrack.track.measurement import refuse_unreadable
 from disctrack.track.pose import DotsInFrames
 from disctrack.track.refine.assembly import fit_all
@@ -168,7 +169,7 @@ def test_what_hardly_moves_for_a_millisecond_is_no_stuck_pixel(rng):
     images = np.full((n, 2, size, size), 200.0)
     images[np.arange(n), :, y, x + np.arange(n) // 50] = 25
     images = np.clip(np.rint(images + rng.normal(0, 1.5, images.shape)), 0, 254).astype(np.uint8)
-    assert stuck_pixels(images[:PAIRS_TRIED, 0])[y, x]  # the trap
+    assert stuck_pixels(images[:SAMPLE, 0])[y, x]  # the trap
     assert _as_one_sensor(blocks_of(images), range(n))[1] == []
     images[:, 1, 5, 5] = 255
     read, told = _as_one_sensor(blocks_of(images), range(n))
