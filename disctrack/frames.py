@@ -24,13 +24,12 @@ Arrays: components on the last axis; image points are (n_frames, n_cameras, n_ma
     camera 0 = left, 1 = right. A frame without a result is NaN with a status, never a missing row.
 """
 
-from collections.abc import Callable
-
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike
 
+from calibration.cameras.camera import converted_rotation
 from calibration.cameras.camera import rotation_from_vector as rotation_from_vector
+from calibration.cameras.camera import vector_from_rotation as vector_from_rotation
 from calibration.kit.arrays import Array
 
 POSE_COMPONENTS = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
@@ -129,23 +128,9 @@ def skew(v: ArrayLike) -> Array:
     return S
 
 
-def vector_from_rotation(R: Array) -> Array:
-    """Rotation vector (..., 3) [rad] of R (..., 3, 3), length in [0, pi]; inverse of `rotation_from_vector`."""
-    return _known_rotations(R, 3, lambda turn: turn.as_rotvec())
-
-
 def quaternion_from_rotation(R: Array) -> Array:
-    """Unit quaternion (w, x, y, z) of R (..., 3, 3) -> (..., 4)."""
-    return np.roll(_known_rotations(R, 4, lambda turn: turn.as_quat()), 1, axis=-1)  # SciPy has the scalar part last
-
-
-def _known_rotations(R: Array, size: int, convert: Callable[..., Array]) -> Array:
-    """Conversion (..., size) of R (..., 3, 3) by SciPy; NaN in, NaN out."""
-    R = np.asarray(R, float)
-    found = np.full((*R.shape[:-2], size), np.nan)
-    known = np.isfinite(R).all(axis=(-2, -1))
-    found[known] = convert(scipy.spatial.transform.Rotation.from_matrix(R[known]))
-    return found
+    """Unit quaternion (w, x, y, z) of R (..., 3, 3) -> (..., 4); NaN in, NaN out."""
+    return np.roll(converted_rotation(R, "as_quat"), 1, axis=-1)  # SciPy has the scalar part last
 
 
 def rotation_from_quaternion(q: Array) -> Array:

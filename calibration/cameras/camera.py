@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
+import scipy
 
 from calibration.cameras._brown import distorted
 from calibration.cameras.splines import LensField
@@ -272,6 +273,21 @@ def rotation_from_vector(v: Array) -> Array:
     S[..., 2, 1], S[..., 0, 2], S[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
     S = S - np.swapaxes(S, -1, -2)
     return np.asarray(np.eye(3) + first * S + second * S @ S, np.float64)
+
+
+def vector_from_rotation(R: Array) -> Array:
+    """Rotation vector (..., 3) [rad] of R (..., 3, 3), length in [0, pi]; inverse of `rotation_from_vector`."""
+    return converted_rotation(R, "as_rotvec")
+
+
+def converted_rotation(R: Array, to: str) -> Array:
+    """R (..., 3, 3) by a method of SciPy's Rotation; NaN in, NaN out."""
+    R = np.asarray(R, float)
+    known = np.isfinite(R).all(axis=(-2, -1))
+    values = getattr(scipy.spatial.transform.Rotation.from_matrix(R[known]), to)()
+    found = np.full((*R.shape[:-2], values.shape[-1]), np.nan)
+    found[known] = values
+    return found
 
 
 @checked

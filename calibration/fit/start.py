@@ -18,8 +18,9 @@ from calibration.kit.errors import CalibrationError
 
 MOST_K1 = 10.0  # larger than in any real lens: above, the views do not determine it
 WIDE = 0.8  # half the image diagonal in focal lengths, 77 deg: the polynomial describes ordinary lenses below
-# Ratio of misfits of the median view, rational over polynomial: 0.25 to 0.73 for a 150 deg lens, 0.98 to 1.00 for eight
-# ordinary cameras with 8 to 20 views.
+# Ratio of misfits below which a richer model is believed. Rational over polynomial, in the median view: 0.25 to 0.73
+# for a 150 deg lens, 0.98 to 1.00 for eight ordinary cameras with 8 to 20 views. Two focal lengths over one: 0.98 for
+# an unchanged lens.
 CLEARLY = 0.85
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig, causes
-from calibration.fit.pairing import GOOD_VIEWS
+from calibration.fit.pairing import GOOD_VIEWS, TWICE
 from calibration.fit.refinement import Refinement, held_out
 from calibration.fit.stereo_model import N_STEREO
 from calibration.judge.pairs import PairMotion
@@ -19,7 +19,6 @@ MIN_TILT_SPREAD_DEG = 20.0  # between the boards' normals: with less, focal leng
 # compared in space, not in px, which depend on the size of the images.
 GRADES = {"excellent": 1e-4, "good": 1e-3, "usable": 1e-2, "poor": np.inf}
 BEYOND_USE = 0.05  # error over a point's distance, above which a rig is kept only on request
-TWICE = 2.0  # times the expected disagreement or held-out error of views, above which the model is incomplete
 
 
 @dataclass(frozen=True)

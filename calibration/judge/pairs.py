@@ -19,20 +19,14 @@ from itertools import pairwise
 import numpy as np
 
 from calibration.board.target import LEAST_POINTS
-from calibration.cameras.camera import CAMERA_NAMES
+from calibration.cameras.camera import CAMERA_NAMES, vector_from_rotation
 from calibration.fit.board_motion import LEAST, BoardMotion, motions
-from calibration.fit.pairing import MIN_VIEWS, TOO_FAR, Names, Pairs, apart, poses_of, relative_poses, rotation_vectors
+from calibration.fit.pairing import MIN_VIEWS, NEARER, TOO_FAR, TWICE, Names, Pairs, apart, poses_of, relative_poses
 from calibration.fit.refinement import Refinement, fit_poses
-from calibration.fit.start import start_camera
+from calibration.fit.start import CLEARLY, start_camera
 from calibration.fit.stereo_model import N_STEREO, Observations, predict, predict_pixels
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import scaled_solve
-
-MOVED = 2.0  # times the scatter of corners, and the motion expected from it, above which motion is reported
-# Ratio of distances between pairs on opposite sides of a step and on one side. It is below 2 in 400 synthetic sets with
-# random motion. Of 31 photographed sets, two have 8.8 and 4.5, and OpenCV confirms the steps; the next one has 2.2.
-STEP = 4.0
-BY_ZOOM = 1.3  # ratio of squared misfits, one focal length over two; an unchanged lens has 1.05
 
 
 @dataclass(frozen=True)
@@ -63,7 +57,7 @@ class PairMotion:
 
     @property
     def _enough(self) -> float:
-        return MOVED * max(self.scatter, self.at_rest)
+        return TWICE * max(self.scatter, self.at_rest)
 
 
 def motion_between_exposures(refinement: Refinement) -> tuple[PairMotion, Array] | None:
@@ -188,7 +182,7 @@ def zoomed(observations: Observations, pairs: Pairs, nominal: Array) -> dict[int
         parts = (paired, paired & ~other, paired & other)
         rough = [start_camera(observations[part], index, nominal, camera.image_size) for part in parts]
         focal, square = [one.fx for one, *_ in rough], [misfit for *_, misfit in rough]
-        if square[0] > BY_ZOOM * (square[1] + square[2]):
+        if square[1] + square[2] < CLEARLY**2 * square[0]:
             found[index] = (
                 f"the {CAMERA_NAMES[index]} camera was zoomed or focused anew while the views were taken: its "
                 f"focal length is {focal[1]:.0f} px in the {len(pairs.stretches[pairs.kept])} views that are used, "
@@ -233,8 +227,8 @@ def compared(observations: Observations, pairs: Pairs, table_view: int | None, f
             odd[int(views[stretch[k]])] = f"{off[k]:.2g} px apart, where the others agree to {usual:.2g} px"
     for (_, pixels, scatter), (before, after) in zip(cuts, pairwise(stretches), strict=True):
         # plain units: random motions contain rotations and shifts that nearly cancel in the image
-        turn = np.median(rotation_vectors(R[after] @ R_pair.T), axis=0)
-        turn -= np.median(rotation_vectors(R[before] @ R_pair.T), axis=0)
+        turn = np.median(vector_from_rotation(R[after] @ R_pair.T), axis=0)
+        turn -= np.median(vector_from_rotation(R[before] @ R_pair.T), axis=0)
         shift = np.median(t[after], axis=0) - np.median(t[before], axis=0)
         steps.append((float(np.linalg.norm(turn)), float(np.linalg.norm(shift)), pixels, scatter))
     kept = int(np.argmax([len(stretch) for stretch in stretches]))
@@ -263,7 +257,7 @@ def _cuts(between: Array) -> list[tuple[int, float, float]]:
     at = min(range(MIN_VIEWS, n - MIN_VIEWS + 1), key=lambda cut: float(to_sides(cut)[0].sum()))
     own, other = to_sides(at)
     pixels, scatter = float(np.median(other)), float(max(np.median(own[:at]), np.median(own[at:])))
-    if not pixels > STEP * scatter:
+    if not pixels > NEARER * scatter:
         return []
     after = [(at + cut, other, own) for cut, other, own in _cuts(between[at:, at:])]
     return [*_cuts(between[:at, :at]), (at, pixels, scatter), *after]
