@@ -11,7 +11,6 @@ from calibration.board.chessboard import BoardNotFound, CornerView, negatives
 from calibration.board.search import Progress, located
 from calibration.board.target import Board, Target
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig
-from calibration.cameras.splines import LensField
 from calibration.fit.board_motion import BoardMotion
 from calibration.fit.lens_field import fit_lens_field
 from calibration.fit.pairing import FLOOR, MIN_VIEWS, Names, Pairs, Views, count_once
@@ -211,22 +210,22 @@ def calibrate_from_corners(
             for v in start.others:
                 views[camera][v] = BoardNotFound(why)
         return calibrate_from_corners(*views, board, tolerances, table_view, board_thickness, names)
-    fit = _fit_jointly(observations, start, board.points, table_view)
-    for (v, camera), why in fit.pairs.bad_images.items():
+    refinement, pairs, motion = _fit_jointly(observations, start, board.points, table_view)
+    for (v, camera), why in pairs.bad_images.items():
         views[camera][v] = BoardNotFound(why)
-    apart = _warnings_of_pairs(fit, names, table_view)
-    _require_fitted(fit, _not_used(views, names), apart, wide, table_view)
-    rig, assessment = _judged(fit, board, tolerances, table_view, board_thickness, wide)
+    apart = _warnings_of_pairs(pairs, names, table_view)
+    _require_fitted(refinement, pairs, _not_used(views, names), apart, wide, table_view)
+    rig, assessment = _judged(refinement, motion, board, tolerances, table_view, board_thickness, wide)
     return StereoCalibration(
         rig=rig,
-        refinement=fit.refinement,
+        refinement=refinement,
         board=board,
         tolerances=tolerances,
         table_view=table_view,
         board_thickness=board_thickness,
         view_names=names,
         corner_views=(tuple(views[0]), tuple(views[1])),
-        apart=tuple(sorted(fit.pairs.apart)),
+        apart=tuple(sorted(pairs.apart)),
         assessment=assessment,
         warnings=(*_used_alone(views, names), *notes, *apart, *assessment.warnings),
     )
@@ -247,18 +246,12 @@ def _begin(views: Views, board: Target, names: Names) -> tuple[Pairs, list[str]]
     return start, [*notes, _choice_of_origin(board)]
 
 
-@dataclass(frozen=True)
-class _JointFit:
-    """Result of `_fit_jointly`."""
-
-    refinement: Refinement  # of the observations, corrected by the lens field if there is one
-    lens_field: LensField | None
-    pairs: Pairs
-    motion: PairMotion | None  # of the boards between the exposures
-
-
-def _fit_jointly(observations: Observations, start: Pairs, nominal: Array, table_view: int | None) -> _JointFit:
+def _fit_jointly(
+    observations: Observations, start: Pairs, nominal: Array, table_view: int | None
+) -> tuple[Refinement, Pairs, PairMotion | None]:
     """Refine, test the pairs with the result, and refine again; then estimate motion of boards and the lens field.
+
+    Returns also the pairs, and the motion of the boards between the exposures.
 
     start : from rough cameras, which are best to detect that a camera was moved, as no pair has biased them
     table_view : determines the stereo pose if a camera was moved
@@ -277,22 +270,22 @@ def _fit_jointly(observations: Observations, start: Pairs, nominal: Array, table
             observations = observations[(observations.view != view) | (observations.camera != camera)]
         used = pairs
         refinement = refined(used)
-    found, (field, corrected) = motion_between_exposures(refinement), fit_lens_field(refinement)
+    found, corrected = motion_between_exposures(refinement), fit_lens_field(refinement)
     motion = found and found[0]
     likely = motion is not None and motion.is_likely
-    if found is not None and motion is not None and likely and field is not None:
+    if found is not None and motion is not None and likely and corrected.lens_field:
         # an (incomplete) lens field moves boards differently in each camera, too: use the scatter before it
         left, _ = motion_between_exposures(corrected) or found
         motion = replace(left, scatter=max(motion.scatter, left.scatter))
         likely = motion.is_seen
     if motion is not None and likely:
-        refinement = refined(used, motion.as_random(nominal))
-        field, corrected = fit_lens_field(refinement)
-    return _JointFit(corrected, field, pairs, motion)
+        corrected = fit_lens_field(refined(used, motion.as_random(nominal)))
+    return corrected, pairs, motion
 
 
 def _judged(
-    fit: _JointFit,
+    refinement: Refinement,
+    motion: PairMotion | None,
     board: Target,
     tolerances: BoardTolerances,
     table_view: int | None,
@@ -300,38 +293,38 @@ def _judged(
     wide: Sequence[tuple[str, str]],
 ) -> tuple[StereoRig, Assessment]:
     """The rig with its covariance, and its assessment."""
-    refinement = fit.refinement
     inflation = max(refinement.disagreement, 1.0)
     shape = board_shape(refinement, board.points, inflation)
     moved = None if refinement.problem.motion else motion_between_exposures(refinement)
     covariance = stereo_covariance(refinement, moved and moved[1])
     origin = on_the_table(board.points, shape)
     rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, covariance, origin)
-    rig = replace(rig, lens_field=fit.lens_field)
+    rig = replace(rig, lens_field=refinement.lens_field)
     with_board = with_tolerances(rig, board.points, table_view, board_thickness, tolerances, shape)
-    return with_board, assess(refinement, rig, with_board, table_view, inflation, fit.motion, wide)
+    return with_board, assess(refinement, rig, with_board, table_view, inflation, motion, wide)
 
 
 def _require_fitted(
-    fit: _JointFit,
+    refinement: Refinement,
+    pairs: Pairs,
     not_used: dict[int, list[Image]],
     apart: Sequence[str],
     wide: Sequence[tuple[str, str]],
     table_view: int | None,
 ) -> None:
     """Raises CalibrationError if the table view cannot be used, or too few views can."""
-    if table_view is not None and (table_view in not_used or table_view in fit.pairs.apart):
+    if table_view is not None and (table_view in not_used or table_view in pairs.apart):
         reason = _with_reasons(not_used[table_view]) if table_view in not_used else apart[0]
         raise CalibrationError(
             f"the table view {table_view} cannot be used ({reason}): without it there is no lab frame. Name another "
             "view whose board lies flat on the table, or take it again."
         )
-    n_used = len(np.unique(fit.refinement.observations.view[fit.refinement.kept]))
+    n_used = len(np.unique(refinement.observations.view[refinement.kept]))
     if n_used < MIN_VIEWS:
         also = "".join(f"{what}: {by_what}. " for what, by_what in wide)
         listed = _listed(image for images in not_used.values() for image in images)
         raise CalibrationError(f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {listed}")
-    for name, camera in zip(CAMERA_NAMES, fit.refinement.model.rig.cameras, strict=True):
+    for name, camera in zip(CAMERA_NAMES, refinement.model.rig.cameras, strict=True):
         if not min(camera.fx, camera.fy) > 0.0:
             raise CalibrationError(
                 f"{name} camera: focal lengths {camera.fx:.1f} and {camera.fy:.1f} px are those of no camera: the "
@@ -416,10 +409,10 @@ def _choice_of_origin(board: Target) -> str:
     )
 
 
-def _warnings_of_pairs(fit: _JointFit, names: Names, table_view: int | None) -> list[str]:
+def _warnings_of_pairs(pairs: Pairs, names: Names, table_view: int | None) -> list[str]:
     """Warnings about pairs whose images are used separately, each for its own camera."""
-    moved = [camera_moved(fit.pairs, names, table_view)] if fit.pairs.steps else []
-    apart = {v: why for v, why in fit.pairs.odd.items() if v not in fit.pairs.others}
+    moved = [camera_moved(pairs, names, table_view)] if pairs.steps else []
+    apart = {v: why for v, why in pairs.odd.items() if v not in pairs.others}
     if not apart:
         return moved
     shown = [f"{names[v][0]} and {names[v][1]} ({why})" for v, why in list(apart.items())[:3]]

@@ -27,15 +27,12 @@ SIZES_PX = ((0.003, 0.01), (0.003, 0.03), (0.01, 0.03), (0.01, 0.1), (0.03, 0.1)
 BETTER = 2.5  # standard errors by which the held-out chi-square must decrease
 
 
-def fit_lens_field(refinement: Refinement) -> tuple[LensField | None, Refinement]:
-    """The field of both lenses, and the refinement of the observations corrected by it.
-
-    None, and the unchanged refinement, if a field does not reduce the held-out error.
-    """
+def fit_lens_field(refinement: Refinement) -> Refinement:
+    """The refinement with the field of both lenses; unchanged if a field does not reduce the held-out error."""
     used = refinement.observations[refinement.kept]
     views = np.unique(used.view)
     if len(views) < GOOD_VIEWS:
-        return None, refinement
+        return refinement
     size = np.array([camera.image_size for camera in refinement.model.rig.cameras]).max(0)
     spacing = float(size.max()) / CELLS
     columns, rows = (int(np.ceil(side / spacing)) + 3 for side in size)
@@ -56,13 +53,13 @@ def fit_lens_field(refinement: Refinement) -> tuple[LensField | None, Refinement
             chi_square[k, test] = [float(np.sum((of_views[v][:, free] @ step) ** 2)) for v in test]
     gain = chi_square[0] - chi_square[1]
     if gain.mean() < BETTER * gain.std() / np.sqrt(len(views) - 1):
-        return None, refinement
+        return refinement
     field = replace(field, coefficients=solution[-field.coefficients.size :].reshape(field.coefficients.shape))
     o = refinement.observations
     moved = np.stack([field.displacement(o.pixels, camera) for camera in (0, 1)])[o.camera, np.arange(len(o))]
     corrected = replace(o, pixels=o.pixels - moved)
     problem, extra = replace(refinement.problem, observations=corrected), refinement.unexplained_sigma**2
-    return field, refined(problem, refinement.model, refinement.kept, extra)
+    return replace(refined(problem, refinement.model, refinement.kept, extra), lens_field=field)
 
 
 def _precision(grid: LensField, sigma: float, smooth: float) -> Array:

@@ -12,6 +12,7 @@ import scipy
 
 from calibration.board.target import LEAST_POINTS
 from calibration.cameras.camera import triangulate
+from calibration.cameras.splines import LensField
 from calibration.fit.board_motion import BoardMotion, updated
 from calibration.fit.normal_equations import Normal, Problem, inverse_covariance, minimise, quadratic
 from calibration.fit.priors import board_basis, priors_of
@@ -41,6 +42,7 @@ class Refinement:
     problem: Problem
     iterations: int
     converged: bool
+    lens_field: LensField | None = None  # by which the observations were corrected
 
     @property
     def disagreement(self) -> float:
