@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from calibration.kit.errors import CalibrationError as CalibrationError
     from calibration.kit.errors import DiscTrackError as DiscTrackError
     from calibration.kit.errors import RigFileError as RigFileError
-    from calibration.points import calibrate_from_points as calibrate_from_points
     from calibration.stereo import StereoCalibration as StereoCalibration
     from calibration.stereo import calibrate_from_corners as calibrate_from_corners
+    from calibration.stereo import calibrate_from_points as calibrate_from_points
     from calibration.stereo import calibrate_stereo as calibrate_stereo
 
 __getattr__, __all__ = imported_when_used(__file__)
