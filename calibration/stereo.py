@@ -69,7 +69,7 @@ class StereoCalibration(Brief):
     @property
     def rejected_views(self) -> dict[int, str]:
         """View -> why neither of its two images is used."""
-        return {v: _with_reasons(images) for v, images in _not_used(self.corner_views, self.view_names).items()}
+        return {v: _listed(images) for v, images in _not_used(self.corner_views, self.view_names).items()}
 
     @property
     def reasons(self) -> dict[str, list[str]]:
@@ -385,7 +385,7 @@ def _require_fitted(
 ) -> None:
     """Raises CalibrationError if the table view cannot be used, or too few views can."""
     if table_view is not None and (table_view in not_used or table_view in pairs.apart):
-        reason = _with_reasons(not_used[table_view]) if table_view in not_used else apart[0]
+        reason = _listed(not_used[table_view]) if table_view in not_used else apart[0]
         raise CalibrationError(
             f"the table view {table_view} cannot be used ({reason}): without it there is no lab frame. Name another "
             "view whose board lies flat on the table, or take it again."
@@ -446,15 +446,11 @@ def _by_reason(images: Iterable[Image]) -> dict[str, list[str]]:
     return found
 
 
-def _with_reasons(images: Iterable[Image]) -> str:
-    return "; ".join(f"{' and '.join(which)}: {reason}" for reason, which in _by_reason(images).items())
-
-
 def _listed(images: Iterable[Image]) -> str:
-    """Each reason once, with the first image that has it; three reasons at most."""
+    """Each reason once, with the images that have it, or the first of more than two; three reasons at most."""
     reasons = _by_reason(images)
     shown = [
-        f"{which[0]}{f' and {len(which) - 1} more' if len(which) > 1 else ''}: {reason}"
+        f"{' and '.join(which if len(which) < 3 else [which[0], f'{len(which) - 1} more'])}: {reason}"
         for reason, which in list(reasons.items())[:3]
     ]
     more = sum(len(which) for which in list(reasons.values())[3:])
