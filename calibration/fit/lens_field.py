@@ -89,7 +89,7 @@ def _rows_of(refinement: Refinement, seen: Observations, grid: LensField) -> Arr
     for axis in (0, 1):
         splines[each, axis, 2 * seen.camera + axis] = values
     of_view = problem.seeing(seen, refinement.unexplained_sigma**2)
-    rows, _, _ = of_view.rows(refinement.model, splines.reshape(len(seen), 2, -1))
+    rows, _ = of_view.rows(refinement.model, splines.reshape(len(seen), 2, -1))
     return eliminate(rows, problem.n_own)[1]
 
 

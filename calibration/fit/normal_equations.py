@@ -29,7 +29,6 @@ class Problem:
     shape_basis: Array  # (n, 3, s2) directions of the target's points
     apart: Mask  # (n_views,) views whose two images have independent poses of the board
     prior: Prior  # of the cameras and of the board's shape
-    huber: float = np.inf  # sigmas beyond which residuals count linearly
     motion: BoardMotion | None = None  # of the boards between the two exposures, for a model with two poses per view
 
     @property
@@ -52,8 +51,8 @@ class Problem:
         """The same with other observations, and `extra` [px^2] added to their covariances in both axes."""
         return replace(self, observations=observations, weights=inverse_covariance(observations.covariance, extra))
 
-    def rows(self, model: StereoModel, beyond: Array | None = None) -> tuple[Array, NDArray[np.intp], Array]:
-        """Whitened rows (r, c) of all data, the view of each (r,), and Huber's loss less chi-square of each view.
+    def rows(self, model: StereoModel, beyond: Array | None = None) -> tuple[Array, NDArray[np.intp]]:
+        """Whitened rows (r, c) of all data, and the view of each (r,).
 
         Columns: pose of the board, or both if some views have two | stereo | shape | beyond (m, 2, b) | residual.
         NaN for points behind their camera.
@@ -64,35 +63,30 @@ class Problem:
             if self.n_own == 12:
                 place = o.camera * (self.apart[o.view] | (self.motion is not None))
                 d_pose = np.concatenate([np.where((place == c)[:, None, None], d_pose, 0.0) for c in (0, 1)], axis=-1)
-            residual = o.pixels - pixels
-            sigmas = np.sqrt(quadratic(self.weights, residual))
-            within = np.minimum(sigmas, self.huber)
-            robust = np.fmin(self.huber / np.maximum(sigmas, 1e-300), 1.0)
-            whitener = np.swapaxes(np.linalg.cholesky(self.weights * robust[:, None, None]), 1, 2)
-            columns = [whitener @ of for of in (d_pose, d_stereo, d_point, residual[..., None])]
+            whitener = np.swapaxes(np.linalg.cholesky(self.weights), 1, 2)
+            columns = [whitener @ of for of in (d_pose, d_stereo, d_point, (o.pixels - pixels)[..., None])]
             columns[2] = columns[2] @ self.shape_basis[o.point]
             columns[3:3] = [] if beyond is None else [whitener @ beyond]
             rows = np.concatenate(columns, axis=-1).reshape(2 * len(o), -1)
             view = np.repeat(o.view, 2)
-            linear: Array = np.bincount(o.view, within * (sigmas - within), V).astype(float)
         if self.motion is not None:
             between, by_poses = motions(model)
             root = np.sqrt(self.motion.weights_of(V) * ((np.bincount(o.view, minlength=V) > 0) & ~self.apart)[:, None])
             tied = np.zeros((V, 6, rows.shape[1]))
             tied[..., :12], tied[..., -1] = root[..., None] * by_poses, -root * between
             rows, view = np.concatenate([rows, tied.reshape(6 * V, -1)]), np.append(view, np.repeat(np.arange(V), 6))
-        return rows, view, linear
+        return rows, view
 
     def linearise(self, model: StereoModel) -> Normal:
         """Normal equations at the model."""
-        rows, view, linear = self.rows(model)
+        rows, view = self.rows(model)
         order, count = np.argsort(view, kind="stable"), np.bincount(view, minlength=self.n_views)
         place, of_view = np.empty(len(view), int), np.zeros((self.n_views, count.max(), rows.shape[1]))
         place[order] = np.arange(len(view)) - np.repeat(np.cumsum(count) - count, count)
         of_view[view, place] = rows
         normal = normal_of_rows(of_view, self.n_own)
-        costs = normal.costs + linear
-        return replace(normal, costs=np.where(np.isfinite(costs), costs, np.inf), prior=self.prior.normal(model))
+        costs = np.where(np.isfinite(normal.costs), normal.costs, np.inf)
+        return replace(normal, costs=costs, prior=self.prior.normal(model))
 
     def stepped(self, model: StereoModel, shared: Array, poses: Array) -> StereoModel:
         """The model after a step."""

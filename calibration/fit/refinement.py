@@ -22,7 +22,7 @@ from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import CalibrationError
 
-FREE_ROUNDS = 6  # of rejection in which points may be accepted again; not in as many more, so that the rounds end
+FREE_ROUNDS = 6  # of robust weights, and of rejection with points accepted again; not in as many more, so that it ends
 FOLDS = 5
 OVERSTATED = 1e-2  # smallest variance of the residuals over that stated
 NEGLIGIBLE = 1e-5  # relative decrease of chi-square: for 10^4 points, a third of a sigma of one parameter
@@ -82,11 +82,13 @@ def refine_stereo(
     model = replace(start, points=nominal)
     problem = Problem(observations, weights, basis, start.apart, priors_of(model, nominal, basis))
     # robust, as whole images may be wrong, and with the declared board
-    rough = Problem(observations, weights, basis[..., :0], start.apart, priors_of(model, nominal, basis[..., :0]), 2.0)
+    rough = Problem(observations, weights, basis[..., :0], start.apart, priors_of(model, nominal, basis[..., :0]))
     residuals = observations.pixels - predict_pixels(model, observations)
-    for _ in range(2):
+    for _ in range(FREE_ROUNDS):
         rough = rough.seeing(observations, _median_variance(residuals))
-        model = minimise(rough, model, iterations=30, tolerance=1e-5, rough=True).model
+        sigmas = np.sqrt(quadratic(rough.weights, residuals))
+        weights = rough.weights / np.fmax(sigmas / 2.0, 1.0)[:, None, None]  # Huber's
+        model = minimise(replace(rough, weights=weights), model, iterations=30, tolerance=1e-5, rough=True).model
         residuals = observations.pixels - predict_pixels(model, observations)
     extra = _median_variance(residuals)
     kept = _accepted(problem, residuals, extra, reject_beyond)

@@ -45,7 +45,7 @@ def errors(found, rig):
     return rig_error(found.rig, rig)[places], found.rig.covariance[np.ix_(places, places)]
 
 
-@pytest.mark.parametrize("known", ["motion", "prior", "outliers"])
+@pytest.mark.parametrize("known", ["motion", "prior"])
 def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(rng, known):
     scene = make_scene(n_views=3, inner_corners=(4, 3))
     nominal, moving = scene.board.points, known == "motion"
@@ -60,22 +60,15 @@ def test_normal_equations_have_the_cost_and_the_gradient_that_they_say(rng, know
     problem = {
         "motion": replace(problem, motion=BoardMotion(2e-3, 5e-4)),
         "prior": replace(problem, prior=replace(prior, weight=3.0)),
-        "outliers": replace(problem, huber=30.0),
     }[known]
 
-    def distances(model):
-        r = observations.pixels - predict_pixels(model, observations)
-        return np.sqrt(np.einsum("mi,mij,mj->m", r, problem.weights, r))
-
     def cost(model):
-        distance = distances(model)
-        within = np.minimum(distance, problem.huber)
-        data = np.sum(within * (2 * distance - within))
+        r = observations.pixels - predict_pixels(model, observations)
+        data = np.einsum("mi,mij,mj->", r, problem.weights, r)
         if problem.motion is not None:
             data += np.sum(motions(model)[0] ** 2 * problem.motion.weights)
         return data + problem.prior.normal(model)[-1, -1]
 
-    assert known != "outliers" or 0.1 < np.mean(distances(model) > problem.huber) < 0.9
     normal = problem.linearise(model)
     assert_allclose(normal.cost, cost(model), rtol=1e-12)
     s = 24 + basis.shape[-1]
