@@ -344,7 +344,7 @@ def _fit_jointly(
     found, corrected = motion_between_exposures(refinement), fit_lens_field(refinement)
     motion = found and found[0]
     likely = motion is not None and motion.is_likely
-    if found is not None and motion is not None and likely and corrected.lens_field:
+    if found is not None and motion is not None and likely and corrected.lens_field is not None:
         # an (incomplete) lens field moves boards differently in each camera, too: use the scatter before it
         left, _ = motion_between_exposures(corrected) or found
         motion = replace(left, scatter=max(motion.scatter, left.scatter))
