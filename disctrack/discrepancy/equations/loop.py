@@ -30,9 +30,9 @@ from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import USED_UP, Candidate, System, Values
 from disctrack.errors import AnalysisError
 
-JUMP = 1e-3  # width of a jump over the rms of its argument: an error of 1e-6 of the work of a friction ...
-SHARP = 1e-3  # ... and over that width, where this changes the motion by more than ...
-BLUNT = 0.1  # ... of chi-square: parameters change by 0.3 sigma at most
+JUMP = 1e-3  # width of a jump over the rms of its argument: an error of 1e-6 of the work of a friction
+SHARPER, SHARPEST = 0.1, 1e-6  # widths of a jump over the one before, and over the first
+BLUNT = 0.1  # of chi-square, by which a sharper jump may change the motion: parameters change by 0.3 sigma at most
 REDUNDANT = 1e-5  # share of a parameter's effect that others cannot absorb, below which it is unidentifiable
 SLOW = 0.25  # of the correlation time of the data without their trend: longer residuals are not taken for noise
 NO_SENSOR = 5.0  # times the noise declared or estimated: larger residuals are no error of a sensor
@@ -218,13 +218,22 @@ def _widths(system: EquationSystem, along: Sequence[tuple[Samples, Array]]) -> d
 
 
 def _with_sharp_jumps(system: EquationSystem, fitted: Fit) -> EquationSystem:
-    """With sharp jumps, if they change the motion significantly.
+    """With jumps so sharp that even sharper ones would not change the motion significantly; mostly unchanged.
 
     The first width is too large where the contact of a ball is very short, or where a motion starts from rest.
     """
-    sharper = replace(system, widths={name: SHARP * width for name, width in system.widths.items()})
-    moved = sharper.linearise(fitted.values, [])[0] - system.linearise(fitted.values, [])[0]
-    return sharper if np.sum(moved**2) > BLUNT * max(1.0, fitted.reduced_chi_square) else system
+    first, share = system.widths, 1.0
+    if not first or not np.isfinite(fitted.chi_square):
+        return system
+    residual = system.linearise(fitted.values, [])[0]
+    while share > SHARPEST:
+        share *= SHARPER
+        sharper = replace(system, widths={name: share * w for name, w in first.items()})
+        moved = residual - (residual := sharper.linearise(fitted.values, [])[0])
+        if np.sum(moved**2) < BLUNT * max(1.0, fitted.reduced_chi_square):
+            break
+        system = sharper
+    return system
 
 
 def _with_sizes(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
