@@ -244,5 +244,4 @@ def trust_region(system: System, quantities: Sequence[Quantity], declared: Mappi
 
     if not all(np.isfinite(part).all() for part in system.linearise(at(start), names)):
         return dict(declared)
-    limits = lower, upper
-    return at(least_squares(residual, start, jacobian, limits, x_scale=size, max_nfev=_ATTEMPTS).x)
+    return at(least_squares(residual, start, jacobian, (lower, upper), x_scale=size, max_nfev=_ATTEMPTS).x)
