@@ -4,7 +4,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import signal
 from scipy.linalg import qr
 
 from calibration.kit.arrays import Array
@@ -13,7 +12,7 @@ from disctrack.discrepancy.equations import terms as library
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
-from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
+from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.noise import (
     autoregression,
@@ -34,8 +33,9 @@ JUMP = 1e-3  # width of a jump over the rms of its argument: an error of 1e-6 of
 SHARPER, SHARPEST = 0.1, 1e-6  # widths of a jump over the one before, and over the first
 BLUNT = 0.1  # of chi-square, by which a sharper jump may change the motion: parameters change by 0.3 sigma at most
 REDUNDANT = 1e-5  # share of a parameter's effect that others cannot absorb, below which it is unidentifiable
-SLOW = 0.25  # of the correlation time of the data without their trend: longer residuals are not taken for noise
+SLOW = 0.05  # of a period of the motion: residuals with a longer correlation time are not taken for noise
 NO_SENSOR = 5.0  # times the noise declared or estimated: larger residuals are no error of a sensor
+FORGOTTEN = float(np.arccos(np.exp(-1.0)) / (2 * np.pi))  # lag of autocorrelation 1/e of an oscillation, in periods
 SCANNED = 8  # values along the motion that are tried for a limit
 NEARLY = 0.2  # of the excess chi-square: an explanation that leaves less is given as the nearest description
 STANDS = 8  # equal extreme samples, above which a sensor may be at its limit
@@ -249,6 +249,9 @@ def _with_sizes(system: EquationSystem, values: Mapping[str, float]) -> Equation
 
 def unidentifiable(system: EquationSystem, values: Mapping[str, float]) -> tuple[str, ...]:
     """Parameters that these data do not distinguish from others; they are to be held as declared."""
+    # a few of many runs are enough
+    every = -(-len(system.stretches) * len(system.formulas.states) // MOST_STATES)
+    system = replace(system, stretches=system.stretches[::every])
     states = [q for q in system.base if q.is_initial]
     free = [q for q in system.base if not q.is_initial and np.isinf(q.prior_sigma)]
     if len(free) < 2:
@@ -279,26 +282,25 @@ def _prewhiten(system: EquationSystem, diagnosis: Diagnosis, settings: Settings)
     if settings.noise is not None or diagnosis.held_out_before is None:
         return diagnosis, False, []
     residual, _ = system.linearise(diagnosis.after.values, [])
-    present, away = np.zeros(residual.shape, bool), np.zeros(residual.shape)
+    present = np.zeros(residual.shape, bool)
     for rows, s in zip(system.blocks, system.stretches, strict=True):
         present[rows] = np.isfinite(s.data)
-        for c in np.flatnonzero(present[rows].any(axis=0)):
-            here = np.flatnonzero(present[rows, c])
-            away[rows.start + here, c] = signal.detrend(s.data[here, c]) / s.sigma[here, c]
     coefficients, share = autoregression(residual, present, system.blocks)
     if not coefficients.any():
         return diagnosis, False, []
     size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
-    lasting = correlation_lag(residual, system.blocks)
+    longest = shooting.longest_stretches(system)
+    lasting = correlation_lag(residual, system.blocks) * float(np.median(np.diff(longest[0].time)))
+    shortest_period = min(min(shooting.period(s), _decorrelation_period(s)) for s in longest)
     # slow residuals are errors of the model, although an autoregression can predict them
-    as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * correlation_lag(away, system.blocks)
+    as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_period
     as_noise &= size <= NO_SENSOR
     white = prewhitened(system, system.blocks, coefficients, present)
     base = fit(white, system.base, diagnosis.before.values) if as_noise else None
     if base is None or not base.converged:
         if diagnosis.verdict != "unexplained":
             return diagnosis, False, []
-        reason = f"residuals are {size:.3g} times the noise, correlated over {lasting:.0f} samples: no sensor's noise"
+        reason = f"residuals are {size:.3g} times the noise and correlated over {lasting:.2g} s: no sensor's noise"
         diagnosis = replace(_with_residual_sigmas(system, diagnosis), reason=reason)
         return diagnosis, False, ["sigmas are scaled to the residuals, which are larger than the noise"]
     noise = float(share * size**2)
@@ -306,6 +308,17 @@ def _prewhiten(system: EquationSystem, diagnosis: Diagnosis, settings: Settings)
     order = int(np.max(np.nonzero(coefficients)[1])) + 1
     text = f"residuals are autocorrelated over {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
     return replace(again, judged=again.judged or white), True, [text]
+
+
+def _decorrelation_period(s: Samples) -> float:
+    """Period [s] of the oscillation whose autocorrelation falls as fast as that of the data.
+
+    In data driven by an arbitrary input the strongest line is the slowest, and not the rate at which they change.
+    """
+    rows = np.isfinite(s.data)
+    mean = np.nansum(s.data, axis=0) / np.maximum(rows.sum(axis=0), 1)  # a channel may show nothing in a stretch
+    away = np.where(rows, (s.data - mean) / s.sigma, 0.0)
+    return correlation_lag(away, [slice(0, len(away))]) * float(np.median(np.diff(s.time))) / FORGOTTEN
 
 
 def _with_residual_sigmas(system: EquationSystem, diagnosis: Diagnosis) -> Diagnosis:

@@ -95,6 +95,12 @@ def period(s: Samples) -> float:
     return found
 
 
+def longest_stretches(system: EquationSystem) -> list[Samples]:
+    """Stretches with at least half as many samples as the longest: a few samples before a gap show no period."""
+    most = max(len(s.time) for s in system.stretches)
+    return [s for s in system.stretches if 2 * len(s.time) >= most]
+
+
 def initial_guess(system: EquationSystem) -> tuple[dict[str, float], Array]:
     """Initial states of every stretch by name, estimated from the data, and the sizes (n,) of the states."""
     f = system.formulas
@@ -171,8 +177,7 @@ def levels(system: EquationSystem, share: float = SHORT) -> list[EquationSystem]
 
     At most MOST_STATES initial states are fitted: of the stretches that start where longer ones do.
     """
-    most, longest = MOST_STATES / len(system.formulas.states), max(len(s.time) for s in system.stretches)
-    long = [s for s in system.stretches if 2 * len(s.time) >= longest]  # a few samples before a gap show no period
+    most, long = MOST_STATES / len(system.formulas.states), longest_stretches(system)
     spacing = min(float(np.median(np.diff(s.time))) for s in long)
     duration = max(share * min(period(s) for s in long), FEWEST * spacing)
     levels: list[list[Samples]] = []
