@@ -156,17 +156,22 @@ def _solve(M, b):
 
 
 @exact_part
-def _stages(rhs, t, step, z, Z, drive, F, J, P, M):
-    """Rates F (3, n) at the stages z + Z (3, n), with derivatives, and the Jacobian M (3 n, 3 n) of their equations."""
+def _stages(rhs, t, step, z, Z, drive, F, J, P, M, left):
+    """Negative residuals of the stage equations for stages z + Z (3 n, 1), and their Jacobian M (3 n, 3 n)."""
     n = len(drive.f)
     for s in range(3):
         at = t + _RADAU_C[s] * step
         inputs_at(at, drive.piece[0], drive.knots, drive.pieces, drive.u, drive.u_rate)
-        rhs(at, z[:n] + Z[s], drive.p, drive.u, drive.u_rate, F[s], J[s], P[s])
-        for r in range(3):
-            M[r * n : (r + 1) * n, s * n : (s + 1) * n] = -step * _RADAU_A[r, s] * J[s]
-    for i in range(3 * n):
-        M[i, i] += 1.0
+        rhs(at, z[:n] + Z[s * n : (s + 1) * n, 0], drive.p, drive.u, drive.u_rate, F[s], J[s], P[s])
+    for s in range(3):
+        for i in range(n):
+            row = s * n + i
+            left[row, 0] = -Z[row, 0]
+            for r in range(3):
+                left[row, 0] += step * _RADAU_A[s, r] * F[r, i]
+                for j in range(n):
+                    M[row, r * n + j] = -step * _RADAU_A[s, r] * J[r, i, j]
+            M[row, row] += 1.0
 
 
 @exact_part
@@ -177,40 +182,52 @@ def _implicit_step(rhs, t, step, z, drive, slope, size, W):
     """
     n, k = len(size), len(drive.columns)
     F, J, P = np.zeros((3, n)), np.zeros((3, n, n)), np.zeros((3, n, len(drive.p)))
-    Z, M, rates, error = np.zeros((3, n)), np.zeros((3 * n, 3 * n)), np.zeros((3, n * k)), np.zeros((n, 1))
-    tolerance = _STIFF_TOLERANCE * np.maximum(size, np.abs(z[:n]))
+    Z, M, change, own = np.zeros((3 * n, 1)), np.zeros((3 * n, 3 * n)), np.zeros((3 * n, 1)), np.zeros((3 * n, k))
+    E, error = np.zeros((n, n)), np.zeros((n, 1))
     for _ in range(_NEWTON):
-        _stages(rhs, t, step, z, Z, drive, F, J, P, M)
-        change = (step * _RADAU_A @ F - Z).reshape(3 * n, 1)
+        _stages(rhs, t, step, z, Z, drive, F, J, P, M, change)
         if not _solve(M, change):
             return np.inf
-        Z += change.reshape(3, n)
-        moved = np.max(np.abs(change.reshape(3, n)) / tolerance)
+        moved = 0.0
+        for j in range(3 * n):
+            Z[j, 0] += change[j, 0]
+            moved = max(moved, abs(change[j, 0]) / (_STIFF_TOLERANCE * max(size[j % n], abs(z[j % n]))))
         if not moved >= _CLOSE:
             break
     if not moved < _CLOSE:
         return np.inf
-    _stages(rhs, t, step, z, Z, drive, F, J, P, M)
-    for s in range(3):
-        rate = J[s] @ z[n:].reshape(k, n).T
-        for c in range(k):
-            if drive.columns[c] >= 0:
-                rate[:, c] += P[s, :, drive.columns[c]]
-        rates[s] = rate.ravel()
-    own = (step * _RADAU_A @ rates).reshape(3 * n, k)
-    error[:, 0] = slope[:n] + _RADAU_E @ Z / step
-    if not (_solve(_REAL / step * np.eye(n) - drive.J, error) and _solve(M, own)):
+    _stages(rhs, t, step, z, Z, drive, F, J, P, M, change)
+    for i in range(n):
+        error[i, 0] = slope[i]
+        for j in range(n):
+            E[i, j] = -drive.J[i, j]
+        E[i, i] += _REAL / step
+        for s in range(3):
+            error[i, 0] += _RADAU_E[s] * Z[s * n + i, 0] / step
+            W[s, i] = Z[s * n + i, 0]
+            for c in range(k):
+                rate = P[s, i, drive.columns[c]] if drive.columns[c] >= 0 else 0.0
+                for j in range(n):
+                    rate += J[s, i, j] * z[n * (c + 1) + j]
+                for r in range(3):
+                    own[r * n + i, c] += step * _RADAU_A[r, s] * rate
+    if not (_solve(E, error) and _solve(M, own)):
         return np.inf
-    W[:, :n] = Z
-    for s in range(3):
-        W[s, n:] = own[s * n : (s + 1) * n].T.flatten()
-    return np.max(np.abs(error[:, 0]) / tolerance)
+    worst = 0.0
+    for i in range(n):
+        worst = max(worst, abs(error[i, 0]) / (_STIFF_TOLERANCE * max(size[i], abs(z[i]))))
+        for c in range(k):
+            for s in range(3):
+                W[s, n * (c + 1) + i] = own[s * n + i, c]
+    return worst
 
 
 @exact_part
 def _along_stages(W, z, x, out):
     """Collocation polynomial of the implicit step at the fraction x of it."""
-    out[:] = z + x * (_RADAU_Q[0] + x * (_RADAU_Q[1] + x * _RADAU_Q[2])) @ W
+    part = x * (_RADAU_Q[0] + x * (_RADAU_Q[1] + x * _RADAU_Q[2]))
+    for i in range(len(z)):
+        out[i] = z[i] + part[0] * W[0, i] + part[1] * W[1, i] + part[2] * W[2, i]
 
 
 @entry
@@ -231,7 +248,9 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
     t, end = span[0], span[1]
     drive.piece[0] = piece_at(t, knots)
     _slope(t, z, K[0], rhs, drive)
-    speed, most = np.max(np.abs(K[0, :n]) / size), _RAN_AWAY * np.max(size)
+    speed, most = 0.0, 0.0
+    for i in range(n):
+        speed, most = max(speed, abs(K[0, i]) / size[i]), max(most, _RAN_AWAY * size[i])
     h = min(end - t, 0.01 / speed) if speed > 0 else 0.01 * (end - t)
     filled, stiff, rejected, at_limit, calm, first = 0, False, False, 0, 0, True
     for taken in range(max_steps):
@@ -293,7 +312,10 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
         h = h * grow if step >= h * 0.999 else max(h, step * grow)
         if stiff:
             _slope(t, z, K[0], rhs, drive)
-            fastest = np.max(np.abs(drive.J) * size / size[:, None])
+            fastest = 0.0
+            for i in range(n):
+                for j in range(n):
+                    fastest = max(fastest, abs(drive.J[i, j]) * size[j] / size[i])
             calm = calm + 1 if h * fastest < _MILD else 0
             stiff = calm < 3
         else:
