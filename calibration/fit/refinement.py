@@ -87,7 +87,7 @@ def refine_stereo(
     for _ in range(FREE_ROUNDS):
         rough = rough.seeing(observations, _median_variance(residuals))
         sigmas = np.sqrt(quadratic(rough.weights, residuals))
-        weights = rough.weights / np.fmax(sigmas / 2.0, 1.0)[:, None, None]  # Huber's
+        weights = rough.weights / np.fmax(sigmas / 2.0, 1.0)[:, None, None]  # Huber's, beyond 2 sigma
         model = minimise(replace(rough, weights=weights), model, iterations=30, tolerance=1e-5, rough=True).model
         residuals = observations.pixels - predict_pixels(model, observations)
     extra = _median_variance(residuals)

@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 from json import JSONDecodeError, loads
@@ -106,7 +107,7 @@ def _ground(folder: Path, scene: Scene | None, q: Array | None) -> Ground:
 
 def _first_pairs(recording: Recording, folder: Path) -> Path:
     """Copy the first pairs and the views of a recording into a folder of its name, renumbered; returns the folder."""
-    folder, tree = folder / recording.name, dict(recording.declared)
+    folder, tree = folder / recording.name, deepcopy(dict(recording.declared))
     for section, place, most in (("cameras", "", PAIRS), ("calibration", "calibration/", None)):
         for camera in CAMERAS:
             files = sorted(recording.folder.glob(tree[section][camera]))[:most]

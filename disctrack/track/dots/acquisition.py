@@ -24,8 +24,7 @@ from disctrack.track.pose import MIN_DOTS, DotsInFrames, fit_poses
 MAX_BLOBS = 24
 EPIPOLAR_PX = 4.0  # centroids of blobs err by up to 1 px under glare, the rig by much less
 INLIER_DIAMETERS = 0.35  # largest distance between a blob and its dot, in diameters of the dot
-# Standard deviation of a blob's centroid under uneven light; beyond twice this, cameras or clocks contradict each other
-BLOB_PX = 0.5
+BLOB_PX = 0.5  # standard deviation of a blob's centroid under uneven light
 CANDIDATES = 40  # poses that are refined
 
 Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]

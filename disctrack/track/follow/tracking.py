@@ -20,10 +20,9 @@ from disctrack.disc import MA_2014, Disc, symmetry_order
 from disctrack.errors import TrackingError
 from disctrack.findings import Finding, Kind, Severity, Subject, in_doubt
 from disctrack.recording.readers.blocks import PairBlock
-from disctrack.track.dots.acquisition import BLOB_PX
 from disctrack.track.follow.following import SAMPLE, Follower, Heading, Tables, empty_tables, follow_block, maps_of, run
 from disctrack.track.judge.cameras import frames_ahead, left_out
-from disctrack.track.judge.disc_not_seen import why_not_seen
+from disctrack.track.judge.disc_not_seen import MEETING_PX, why_not_seen
 from disctrack.track.judge.doubts import MOVED
 from disctrack.track.pose import DotsInFrames, fit_poses
 from disctrack.track.refine.assembly import Measurement, Taken, TrackingSettings, assemble
@@ -116,7 +115,7 @@ def _check_dots(disc: Disc) -> None:
 
 def _dropped(tracking: Measurement, read_blocks: ReadBlocks, pairs: range, begin: Follower) -> tuple[Finding, ...]:
     """Images left out by one camera, from the pairing that fits the frames after the gap."""
-    apart = _apart(tracking) | (max(tracking.details["systematic_px"]) > BLOB_PX)
+    apart = _apart(tracking) | (max(tracking.details["systematic_px"]) > MEETING_PX / 2)
     long = stretches(apart, APART)
     if not len(long) or Kind.DELAY in {finding.kind for finding in tracking.trajectory.findings}:
         return ()
@@ -150,7 +149,7 @@ def _conflicts(tracking: Measurement, noticed: tuple[Finding, ...], read_blocks:
     kinds = {finding.kind for finding in noticed}
     status = tracking.trajectory.frame_status
     contradicted = Kind.ONE_SIDED in kinds or 2 * np.sum(status == FrameStatus.CONTRADICTED) > len(status)
-    far = _faulty(noticed) and max(tracking.details["systematic_px"]) > 2 * BLOB_PX
+    far = _faulty(noticed) and max(tracking.details["systematic_px"]) > MEETING_PX
     if not (contradicted or far) or Kind.DROPPED_FRAMES in kinds:  # dropped frames explain the contradiction
         return _some(read_blocks, pairs[:0])
     rows = np.flatnonzero(_apart(tracking) | (far & (status == FrameStatus.MEASURED)))

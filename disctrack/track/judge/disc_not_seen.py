@@ -41,6 +41,7 @@ TURN, SHIFT = np.radians(1.0), 2e-3  # [rad], [m] prior sigmas of an unnoticed m
 DOT_DIAMETERS_PX = (6.0, 18.0, 54.0, 162.0)  # each search finds blobs of a seventh to twice the diameter
 SIZE_TOLERANCE = 0.15  # blur and threshold make a blob larger or smaller than its dot
 MISPLACED = 0.2  # relative error of distances between dots: measured with a ruler, say; beyond, wrongly identified
+MEETING_PX = 2 * acquisition.BLOB_PX  # misfit beyond which cameras or clocks contradict each other
 
 
 def why_not_seen(pairs: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
@@ -104,7 +105,7 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
     rms, moved = acquisition.BLOB_PX * np.sqrt(reduced), rig.perturbed(found[:N_RIG])
     turn = np.linalg.norm(vector_from_rotation(moved.R_right_left @ rig.R_right_left.T))
     shift = np.linalg.norm(moved.t_right_left - rig.t_right_left)
-    if rms[-1] < 2 * acquisition.BLOB_PX < rms[0]:
+    if rms[-1] < MEETING_PX < rms[0]:
         text = (
             f"the right camera was turned by about {np.degrees(turn):.1f} deg and shifted by {1e3 * shift:.0f} mm "
             f"against the left one since the calibration (what both see of the dots fits to {rms[-1]:.1f} px then, to "
@@ -149,7 +150,7 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding,
         remedy = Remedy("[markers] diameter_mm", f"{1e3 * diameter:.2g}", f"{1e3 * disc.marker_diameter:g}")
         text = "the dots' images are of another size"
         return (Finding(Kind.DIAMETER, Severity.DOUBT, text, remedies=(remedy,), explains=NONSENSE),)
-    if not which.all() or misfit_px > 2 * acquisition.BLOB_PX:
+    if not which.all() or misfit_px > MEETING_PX:
         return ()
     shift = (points - t) @ R - disc.marker_centres_body
     return misplaced_dots(disc, disc.marker_centres_body + declared_places_kept(disc, shift[:, :2]))
