@@ -103,14 +103,19 @@ def test_neighbouring_stuck_pixels_do_not_stand_in_for_each_other(rng):
     assert np.all(images[0][mask] < 120)
 
 
+@pytest.fixture
+def views(sample_clip):
+    """Images of the board by camera."""
+    files = {side: sorted((sample_clip / "calibration" / side).glob("*.png")) for side in ("left", "right")}
+    return {side: [cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in some] for side, some in files.items()}
+
+
 @pytest.mark.statistical
-def test_pixels_that_do_not_see_are_named_in_views_and_cost_no_corner(sample_clip, rng):
-    views, spoilt = {}, {}
-    for side in ("left", "right"):
-        files = sorted((sample_clip / "calibration" / side).glob("*.png"))
-        views[side] = [cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]
-        assert stuck_pixels(views[side], of_board=True) is None
-        where, spoilt[side] = rng.permutation(views[side][0].size)[:50], [view.copy() for view in views[side]]
+def test_pixels_that_do_not_see_are_named_in_views_and_cost_no_corner(views, rng):
+    spoilt = {}
+    for side, clean in views.items():
+        assert stuck_pixels(clean, of_board=True) is None
+        where, spoilt[side] = rng.permutation(clean[0].size)[:50], [view.copy() for view in clean]
         for view in spoilt[side]:
             view.flat[where[::2]], view.flat[where[1::2]] = 255, 0
     found = calibrate_stereo(spoilt["left"], spoilt["right"], Board((9, 6), 6e-3))
@@ -131,11 +136,9 @@ def test_pixels_that_do_not_see_are_named_in_views_and_cost_no_corner(sample_cli
 
 
 @pytest.mark.statistical
-def test_pixels_that_do_not_see_are_replaced_in_colour_views_and_in_arrays(sample_clip, rng):
+def test_pixels_that_do_not_see_are_replaced_in_colour_views_and_in_arrays(views, rng):
     notes = {}
-    for side in ("left", "right"):
-        files = sorted((sample_clip / "calibration" / side).glob("*.png"))
-        grey = [cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in files]
+    for side, grey in views.items():
         seen = [np.stack([view, view, view // 2], axis=-1) for view in grey]
         clean, note = repaired_views(seen, side)
         assert note == ""

@@ -63,8 +63,7 @@ def test_halves_of_the_opencv_photographs_agree_within_what_each_states(opencv_p
 def test_sample_clip_gives_the_cameras_it_was_rendered_with(sample_clip):
     with h5py.File(sample_clip.parent / "truth" / "clip.h5") as file:
         truth = read_rig_group(file["rig"])
-    files = (sorted((sample_clip / "calibration" / side).glob("*.png")) for side in ("left", "right"))
-    views = ([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in side] for side in files)
+    views = read_pairs(sample_clip / "calibration", "{side}/{i:02d}.png", range(18))
     found = calibrate_stereo(*views, Board((9, 6), 6e-3), None, 0, 3e-3)
     rig = found.rig
     error = rig_error(rig, truth)

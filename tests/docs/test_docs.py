@@ -29,10 +29,7 @@ PAGES = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
 BLOCK = re.compile(r"^(?:(<!-- slow -->)\n)?```(sh|python|toml)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 IN_TEXT = re.compile(r"`(disctrack [^`]+)`")
-
-
-def names(pages):
-    return [page.name for page in pages]
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 
 def text_of(page: Path) -> str:
@@ -79,7 +76,7 @@ def run_shell(block: str, folder: Path) -> None:
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
+@each_page
 def test_short_blocks_run(page, workplace, monkeypatch):
     monkeypatch.chdir(workplace)
     scope: dict[str, object] = {}
@@ -103,7 +100,7 @@ def measured(tmp_path_factory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
+@each_page
 def test_all_blocks_run_in_their_order(page, measured, monkeypatch):
     monkeypatch.chdir(measured)
     scope: dict[str, object] = {}
@@ -118,7 +115,7 @@ def test_all_blocks_run_in_their_order(page, measured, monkeypatch):
         assert "centre_of_mass" in text
 
 
-@pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
+@each_page
 def test_every_command_exists_with_its_options(page, monkeypatch):
     text = text_of(page)
     written = [command for kind, _, block in blocks_of(text) if kind == "sh" for command in commands_of(block)]
@@ -135,7 +132,7 @@ def test_every_command_exists_with_its_options(page, monkeypatch):
                 assert word.partition("=")[0] in known, f"{' '.join(command)}: no option {word}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
+@each_page
 def test_every_block_is_one_for_every_renderer_of_markdown(page):
     """One word after the fence: with two, Python's Markdown, of which the site is built, takes it for a paragraph."""
     fences = re.findall(r"^```.*$", text_of(page), re.MULTILINE)
@@ -144,7 +141,7 @@ def test_every_block_is_one_for_every_renderer_of_markdown(page):
     assert sum(len(fence) > 3 for fence in fences) == len(blocks_of(text_of(page)))  # all are run, or read
 
 
-@pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
+@each_page
 def test_links_and_pictures_are_there(page):
     for target in LINK.findall(BLOCK.sub("", text_of(page))):
         if target.startswith(("http:", "https:")):

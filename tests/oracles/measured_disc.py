@@ -12,9 +12,7 @@ from disctrack.rolling import CATALOGUE, Model
 from disctrack.synthetic.description import Scene
 from disctrack.track.pose import DotsInFrames
 from disctrack.validate import points
-from disctrack.validate.points import SIGMA_PX
 
-__all__ = ["SIGMA_PX"]
 K_M = CATALOGUE["km"]().values["k_m"]  # [m s^2] as published, known of to every diagnosis
 
 

@@ -236,7 +236,7 @@ def coordinates(disc, states):
 
 def course(disc, times, states):
     """Spline of q over the times, through states (15, n) with their own rates."""
-    moving = [Instant(disc, s) for s in states.T]
+    moving = [Instant(disc.at(t), s) for t, s in zip(times, states.T, strict=True)]
     speed = np.array([[*now.v, now.psidot, now.thetadot, now.phidot] for now in moving])
     return CubicHermiteSpline(times, coordinates(disc, states), speed)
 

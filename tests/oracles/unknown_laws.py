@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from disctrack.synthetic.description import Scene
 from tests.oracles import newton_euler
@@ -326,7 +325,7 @@ UNKNOWN["drag_and_steps"] = Unknown(both(UNKNOWN["drag_one_way"].law, UNKNOWN["f
 
 
 def motion(unknown: Unknown):
-    """(times, q (n, 6), speeds (n, 6), true moment (n, 3) along n0, m0, k; NaN where there is none)."""
+    """Times (n,), spline of q over them, true moment (n, 3) along n0, m0, k; NaN where there is none."""
     laws = [newton_euler.precession_friction(K_M), *([unknown.law] if unknown.law else [])]
     sizes = DISC.radius, DISC.half_thickness, DISC.mass
     how = {"friction": unknown.friction, "wanders": unknown.com, "wears": unknown.wears}
@@ -350,19 +349,11 @@ def motion(unknown: Unknown):
     method = {"method": "DOP853" if regime == "rolling" else "LSODA"}
     found = newton_euler.follow(body, state, times, regime, rtol=1e-10, atol=1e-11, max_step=1e-3, events=low, **method)
     assert found.success, found.message
-    states = found.y.T
-    q = newton_euler.coordinates(body, found.y[:15])
-    speed, wrench = np.zeros_like(q), np.full((len(q), 3), np.nan)
-    for i, (t, s) in enumerate(zip(found.t, states, strict=True)):
-        now = newton_euler.Instant(body.at(t), s)
-        speed[i] = *now.v, now.psidot, now.thetadot, now.phidot
+    wrench = np.full((len(found.t), 3), np.nan)
     if regime == "rolling" and unknown.com is None and unknown.shift is None and not unknown.wears:
-        for i in range(0, len(q), 6):
-            wrench[i] = moment_of(body.at(found.t[i]), states[i])
-    if unknown.shift is not None:
-        q, later = q + unknown.shift(found.t), unknown.shift(found.t + 1e-5)
-        speed += (later - unknown.shift(found.t)) / 1e-5
-    return found.t, q, speed, wrench
+        for i in range(0, len(wrench), 6):
+            wrench[i] = moment_of(body.at(found.t[i]), found.y[:, i])
+    return found.t, newton_euler.course(body, found.t, found.y), wrench
 
 
 def moment_of(body, state):
@@ -386,8 +377,10 @@ class Recording:
 
 def recording(unknown: Unknown | str, seed: int = 1) -> Recording:
     """Dots of the motion with this law, or that of this name, until 1.2 deg."""
-    times, q, speed, wrench = motion(UNKNOWN[unknown] if isinstance(unknown, str) else unknown)
+    unknown = UNKNOWN[unknown] if isinstance(unknown, str) else unknown
+    times, q, wrench = motion(unknown)
+    seen = q if unknown.shift is None else lambda t: q(t) + unknown.shift(t)
     n = int((times[-1] - 0.01) * RATE)
-    trajectory = measured(seed=seed, n=n, declared_rate=RATE, motion=CubicHermiteSpline(times, q, speed))
+    trajectory = measured(seed=seed, n=n, declared_rate=RATE, motion=seen)
     known = np.isfinite(wrench).all(axis=1)
     return Recording(trajectory, times[known] - STATION, wrench[known])

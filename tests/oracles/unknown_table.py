@@ -15,28 +15,8 @@ import numpy as np
 
 from disctrack import diagnose
 from disctrack.diagnosis.errors import residual_tests, simulated
-from disctrack.frames import nodal_axes_world
+from disctrack.diagnosis.form_misfit import moment_about_contact
 from tests.oracles.unknown_laws import UNKNOWN, Recording, recording
-
-VERTICAL = np.array([0.0, 0.0, 1.0])
-
-
-def required_moment(disc, motion) -> np.ndarray:
-    """Moment (n, 3) about the contact that a motion needs, whatever supplies it, in (n0, m0, k) [N m].
-
-    From the balances of momentum and of angular momentum of a homogeneous disc with a sharp edge on a level table.
-    """
-    e1, e2, e3 = nodal_axes_world(motion.q[:, 3], motion.q[:, 4])
-    force = disc.mass * (motion.acceleration_world + 9.81 * VERTICAL)
-
-    def momentum(turning):
-        along = np.sum(turning * e3, axis=-1, keepdims=True)
-        return disc.moment_diametral * turning + (disc.moment_axial - disc.moment_diametral) * along * e3
-
-    rate = momentum(motion.angular_acceleration_world) + np.cross(motion.omega_world, momentum(motion.omega_world))
-    moment = rate - np.cross(disc.arm_to_contact(e2, e3), force)
-    to_contact = np.stack([e1, np.cross(VERTICAL, e1), np.broadcast_to(VERTICAL, e1.shape)], axis=-2)
-    return np.einsum("nij,nj->ni", to_contact, moment)
 
 
 def line(name: str, seed: int) -> str:
@@ -61,9 +41,10 @@ def against(made: Recording, result) -> list[str]:
     """Rms of error and truth of the moment, and the error in sigmas where the law has a course with sigmas."""
     of = lambda at: np.stack([np.interp(at, made.time, made.moment[:, i]) for i in range(3)], axis=1)  # noqa: E731
     rms = lambda x: 1e6 * np.sqrt(np.mean(x**2, axis=0))  # noqa: E731
-    motion = simulated(result.system, result.diagnosis.after.values)
+    values = result.diagnosis.after.values
+    motion = simulated(result.system, values)
     truth = of(motion.time)
-    errors = rms(required_moment(result.system.disc, motion) - truth)
+    errors = rms(moment_about_contact(result.system, values, motion) - truth)
     told = [" ".join(f"{error:.2f}/{size:.0f}" for error, size in zip(errors, rms(truth), strict=True))]
     course = result.learned.course if result.learned else None
     if course is not None:

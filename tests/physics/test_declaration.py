@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from calibration.cameras.camera import Camera, StereoRig, placed_at
 from disctrack import MarkerStatus, Trajectory, frames
 from disctrack.analyse.declaration import (
     balance,
@@ -21,6 +20,8 @@ from disctrack.analyse.declaration import (
     unseen_dots,
 )
 from disctrack.findings import Kind, Severity
+from disctrack.synthetic.cameras import rig_of
+from disctrack.synthetic.description import Scene
 from tests.physics.conftest import as_tracked, true_motion
 
 SIXTHS = np.radians(60.0 * np.arange(6))
@@ -203,39 +204,29 @@ def test_a_dot_without_which_the_layout_repeats_spoils_the_spin_angle(honest):
     assert finding.doubtful, "six dots in a hexagon are left"
 
 
-def camera_rig(left, right):
-    """Cameras at two places [m] that look at the origin, on the table."""
-    target = np.zeros(3)
-    poses = []
-    for place in map(np.asarray, (left, right)):
-        forward = (target - place) / np.linalg.norm(target - place)
-        across = np.cross(forward, [0, 0, 1.0])
-        across /= np.linalg.norm(across)
-        R = np.stack([across, np.cross(forward, across), forward])
-        poses.append((R, -R @ place))
-    camera = Camera(1000.0, 1000.0, 255.5, 255.5, (0.0,) * 5, (512, 512))
-    return StereoRig(camera, camera, **placed_at(poses), world_is_table=True)
+def cameras_at(left_deg, right_deg, off_vertical_deg=(40.0, 40.0)):
+    """Cameras in these directions from the middle of the table, at which they look."""
+    placed = {"azimuth_deg": (left_deg, right_deg), "off_vertical_deg": off_vertical_deg, "variation": 0.0}
+    return rig_of(Scene().changed(rig=placed))
 
 
-@pytest.mark.parametrize("azimuth", [0.0, 1.0, 2.5, 4.0])
-def test_a_mirrored_world_is_told_by_the_cameras_places_or_by_dots_without_an_axis(azimuth, honest):
-    turn = frames.rotation_from_vector(np.array([0.0, 0.0, azimuth]))
-    left, right = np.array([[-0.15, -0.4, 0.5], [0.15, -0.4, 0.5]]) @ turn.T
-    assert handedness(camera_rig(left, right), honest.disc) == ()
-    mirror = [1.0, -1.0, 1.0]
-    (finding,) = handedness(camera_rig(left * mirror, right * mirror), honest.disc)
+@pytest.mark.parametrize("turn_deg", [0.0, 57.0, 143.0, 229.0])
+def test_a_mirrored_world_is_told_by_the_cameras_places_or_by_dots_without_an_axis(turn_deg, honest):
+    left_deg, right_deg = turn_deg - 110.0, turn_deg - 70.0
+    assert handedness(cameras_at(left_deg, right_deg), honest.disc) == ()
+    mirrored = cameras_at(-left_deg, -right_deg)
+    (finding,) = handedness(mirrored, honest.disc)
     assert finding.doubtful
     assert "mirrored" in finding.sentence
     assert "exchanged" in finding.sentence
     asymmetric = honest.disc.marker_centres_body.copy()
     asymmetric[0, :2] *= 0.6
     lopsided = replace(honest.disc, marker_centres_body=asymmetric)
-    assert handedness(camera_rig(left * mirror, right * mirror), lopsided) == ()
+    assert handedness(mirrored, lopsided) == ()
 
 
 def test_cameras_that_face_each_other_tell_no_left_and_right(honest):
-    across = camera_rig((0.5, 0.0, 0.5), (-0.5, 0.01, 0.5))
-    above = camera_rig((0.0, -0.01, 0.6), (0.0, -0.4, 0.6))
+    across, above = cameras_at(0.0, 179.0), cameras_at(-90.0, -90.0, (1.0, 34.0))
     assert handedness(across, honest.disc) == handedness(above, honest.disc) == ()
 
 

@@ -56,10 +56,8 @@ def test_a_law_of_the_wrong_sign_is_noticed(rng):
 
 def test_laws_that_read_psidot_but_work_on_phidot_say_so(rng):
     """Without the restriction to psidot phidot < 0 their power has both signs."""
-    for name in LAWS:
-        effect = CATALOGUE[name]()
-        if name in COUNTER_ROTATING:
-            assert effect_power(effect, random_motion(rng, 500, False), np.full(500, 2.0)).max() > 0
+    for name in COUNTER_ROTATING:
+        assert effect_power(CATALOGUE[name](), random_motion(rng, 500, False), np.full(500, 2.0)).max() > 0
 
 
 @pytest.mark.parametrize("name", LAWS)

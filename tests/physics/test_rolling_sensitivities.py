@@ -225,10 +225,7 @@ def test_a_pulse_of_any_component_moves_the_disc_as_its_sensitivity_says(nutatin
     probed = model.knowing(probe).with_values(dict.fromkeys(names, 0.0))
     carried = sensitivities(probed, state, times, names, (), THETA_END).dq
     # the integral is of fourth order in 0.5 ms over 20 ms: 4e-7; the derivatives hold to 1e-9
-    assert np.abs(moved - carried).max(axis=0) == pytest.approx(0.0, abs=1e-6 * np.abs(carried).max())
-    for component in range(len(COMPONENTS)):
-        scale = np.abs(carried[..., component]).max(axis=0)
-        assert (np.abs(moved - carried)[..., component].max(axis=0) < 1e-6 * scale).all()
+    assert (np.abs(moved - carried).max(axis=0) < 1e-6 * np.abs(carried).max(axis=0)).all()
 
 
 def test_where_the_motion_ends_there_are_no_responses(nutating):

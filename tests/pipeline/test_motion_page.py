@@ -2,7 +2,10 @@
 
 import json
 import re
+import shutil
+import subprocess
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,7 +13,6 @@ import disctrack
 from disctrack.analyse.analysis import analyse
 from disctrack.analyse.motion_page import motion_html
 from disctrack.track.video_overlay import draw_pair
-from tests.oracles.browser import BROWSER, browse, screenshot
 from tests.pipeline.conftest import images_of
 
 
@@ -61,11 +63,27 @@ def test_gaps_are_null_and_not_numbers(measured):
     assert "were not at hand" in text
 
 
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+FLAGS = (
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
+    "--disable-component-update --disable-sync --hide-scrollbars --virtual-time-budget=4000 --enable-logging=stderr"
+)
+
+
+def browse(page, profile, *flags):
+    """What the browser writes when it shows frame 30 of the page without an error."""
+    command = [BROWSER, *FLAGS.split(), f"--user-data-dir={profile}", *flags, f"{page.as_uri()}#frame=30"]
+    done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
+    problems = [line for line in done.stderr.splitlines() if "CONSOLE" in line and "Uncaught" in line]
+    assert not problems, problems
+    return done.stdout
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no browser on this machine")
 def test_a_browser_shows_the_frame_that_was_asked_for(page, measured, tmp_path):
     trajectory, *_ = measured
-    dom = browse(page, tmp_path / "profile", "--dump-dom", place="#frame=30")
+    dom = browse(page, tmp_path / "profile", "--dump-dom")
     assert f"frame 30   t = {trajectory.time[30]:.4f} s" in dom
     assert f"θ {np.degrees(trajectory.q[30, 4]):.3f}" in dom
 
@@ -81,7 +99,9 @@ def test_a_browser_shows_the_frame_that_was_asked_for(page, measured, tmp_path):
     ],
 )
 def test_light_dark_and_phone_are_drawn(page, size, flags, background, tmp_path):
-    image = screenshot(page, tmp_path, size, *flags, place="#frame=30")
+    picture, (width, height) = tmp_path / "page.png", size
+    browse(page, tmp_path / "profile", f"--screenshot={picture}", f"--window-size={width},{height}", *flags)
+    image = cv2.imread(str(picture))
     assert tuple(int(v) for v in image[3, 3]) == background
     blue, vermilion = [(178, 114, 0), (232, 185, 109)], [(0, 94, 213), (92, 154, 255)]
     for inks in (blue, vermilion):  # the curves; the cursor, in the colours of light or dark

@@ -25,10 +25,10 @@ from disctrack.synthetic.optics import corner_rays, digitise, sensor_pattern
 from disctrack.synthetic.recording import recording_toml, write_recording
 from tests.rendering import expected_disc, render_board, render_disc
 
-PLAIN = description.Scene(
-    appearance=description.AppearanceSettings(table=0.0, table_streaks=0.0, table_blotches=0.0),
-    light=description.LightSettings(directed=0.0),
-    optics=description.OpticsSettings(vignetting=0.0),
+PLAIN = description.Scene().changed(
+    appearance=dict.fromkeys(("table", "table_streaks", "table_blotches"), 0.0),
+    light={"directed": 0.0},
+    optics={"vignetting": 0.0},
 )
 POSES = [
     [0.032, 0.020, 0.0045, 0.3, np.radians(0.5), 1.0],
@@ -316,13 +316,11 @@ def test_off_by_default_and_declared_only_where_exact():
     assert "tolerance" not in recording_toml(uneven)
 
 
-SMALL = description.Scene(
-    name="small",
-    cameras=description.CameraSettings(image_size=(256, 256), n_frames=4),
-    rig=description.RigSettings(mm_per_px=0.5),
-    board=description.BoardSettings(n_views=3),
-    light=description.LightSettings(directed=0.0),
-    motion=description.MotionSettings(kind="table", table="motion.csv"),
+SMALL = description.Scene(name="small", motion=description.MotionSettings("table", table="motion.csv")).changed(
+    cameras={"image_size": (256, 256), "n_frames": 4},
+    rig={"mm_per_px": 0.5},
+    board={"n_views": 3},
+    light={"directed": 0.0},
 )
 VELOCITY = np.array([0.5, -0.3, 0.0, 10.0, 1.0, -5.0])  # m/s, rad/s
 START = np.array([0.032, 0.020, 0.012, 0.5, 0.3, 0.7])

@@ -99,11 +99,10 @@ def test_dots_that_are_all_edge_have_no_bias(mm_per_px, blur_px, thinnest):
 
 def _shortest_half_axes(pairs):
     """(n, 2, m) [px] of the dots' images, by the homography of their neighbourhood."""
-    step, radius = 1e-5, 0.5 * pairs.disc.marker_diameter
-    arms = [pairs.disc.marker_centres_body + step * np.eye(3)[axis] for axis in (0, 1)]
-    ends = [pairs.rig.project(arm @ np.swapaxes(pairs.R, 1, 2) + pairs.q[:, None, :3]) for arm in arms]
-    gradient = np.stack([(end - pairs.true_pixels) / step * radius for end in ends], axis=-1)
-    return np.linalg.svd(gradient, compute_uv=False)[..., 1]
+    centres = pairs.disc.marker_centres_body @ np.swapaxes(pairs.R, 1, 2) + pairs.q[:, None, :3]
+    by_point = pairs.rig.project_with_jacobians(centres)[1]
+    axes = 0.5 * pairs.disc.marker_diameter * by_point @ pairs.R[:, None, None, :, :2]
+    return np.linalg.svd(axes, compute_uv=False)[..., 1]
 
 
 def test_scatter_equals_the_predicted_covariance(rendered_pairs, rng):

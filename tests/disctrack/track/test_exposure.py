@@ -51,7 +51,7 @@ def measured(rendered_pairs, motion):
     return motion[0][:, 4], [measured_with(images, rendered_pairs, exposure) for exposure in told]
 
 
-def _against_drawn_dots(q, R, found, chosen, rig, disc, dark, noise, blur_px):
+def _against_drawn_dots(q, R, found, chosen, rig, disc, look):
     """Shifts of the template by the smear, by dots drawn along the motion; by the mean of their path; as `found`."""
     expected, by_path, given = [], [], []
     turn = np.linspace(0, 2 * np.pi, 16, endpoint=False)
@@ -65,8 +65,9 @@ def _against_drawn_dots(q, R, found, chosen, rig, disc, dark, noise, blur_px):
             affine = np.swapaxes(edges - centres[:, None], 1, 2) @ circle / 8
             window = np.round(centres[4]) - 31
             cover = [covered(centres[k] - window, affine[k], 0.6, SIMPSON) for k in (np.arange(9), [4] * 9)]
-            at = {"centre": centres[4], "affine": affine[4], "noise": noise, "blur_px": blur_px}
-            smeared, still = (locate_in_window(50000 - (50000 - dark) * share, **at).pixels[0] for share in cover)
+            at = {"centre": centres[4], "affine": affine[4], "noise": look.noise, "blur_px": look.blur_px}
+            images = (look.level * (1 - look.contrast * share) for share in cover)
+            smeared, still = (locate_in_window(image, **at).pixels[0] for image in images)
             expected.append(smeared - still)
             by_path.append(SIMPSON @ centres - centres[4])
             given.append(found[frame, camera, dot])
@@ -89,7 +90,7 @@ def test_the_shift_is_that_of_the_template(motion, rendered_pairs, dark, noise):
 
     dots = ((3, 0), (9, 1), (14, 2), (28, 3), (33, 4), (37, 0), (6, 2), (11, 4))
     chosen = [(*dot, (0, 1)) for dot in dots]
-    expected, by_path, given = _against_drawn_dots(q, R, found, chosen, rig, disc, dark, noise, 0.65)
+    expected, by_path, given = _against_drawn_dots(q, R, found, chosen, rig, disc, edge)
     size = np.sqrt(np.mean(expected**2))
     assert size > 0.002  # px
     assert np.sqrt(np.mean((given - expected) ** 2)) < 0.25 * size
@@ -99,7 +100,7 @@ def test_the_shift_is_that_of_the_template(motion, rendered_pairs, dark, noise):
 @pytest.mark.statistical
 def test_a_dot_seen_obliquely_is_pulled_as_an_ellipse(rendered_pairs):
     """At 55 deg of nutation, dots up to 75 deg off their normal."""
-    rig, disc, noise = rendered_pairs.rig, rendered_pairs.disc, NoiseModel(4e5, 0.0)
+    rig, disc = rendered_pairs.rig, rendered_pairs.disc
     rate = 2500.0  # a millisecond would smear them by more than a blur
     q = rolled(disc, 55, rate)[0]
     R_cw, t_cw = rig.camera_poses()[0]
@@ -111,11 +112,11 @@ def test_a_dot_seen_obliquely_is_pulled_as_an_ellipse(rendered_pairs):
     cosine = -((R_cw @ R[:, 4])[..., 2] * line).sum(-1) / np.linalg.norm(line, axis=-1)
     oblique = [(int(frame), 0, (0,)) for frame in np.flatnonzero((cosine > 0.27) & (cosine < 0.5))[1:-1:2]]
     assert len(oblique) >= 4
-    edge = Edge(0.7, 50000.0, 0.8, noise)
+    edge = Edge(0.7, 50000.0, 0.8, NoiseModel(4e5, 0.0))
     exposures = np.array([1, 1]) / rate
     radius, dots = 0.5 * disc.marker_diameter, dots_at(R[:, 4], q[:, 4, :3], rig, disc)
     found = shift_by_exposure(*dots, np.arange(N) / rate, exposures, radius, (edge, edge))
-    expected, _, ellipses = _against_drawn_dots(q, R, found, oblique, rig, disc, 10000, noise, 0.7)
+    expected, _, ellipses = _against_drawn_dots(q, R, found, oblique, rig, disc, edge)
     size = np.sqrt(np.mean(expected**2))
     assert size > 0.002  # px
     # single dots scatter by 7e-4 px, with the place of their edge among the pixels that they are drawn with

@@ -21,7 +21,8 @@ from disctrack.track.refine.self_calibration import (
     share_of_places,
 )
 from disctrack.trajectory import FrameStatus
-from tests.oracles.measured_disc import SIGMA_PX, dots_of, measured
+from disctrack.validate.points import SIGMA_PX
+from tests.oracles.measured_disc import dots_of, measured
 from tests.oracles.point_laboratory import DOT_PX, tracked
 
 N = 160

@@ -199,10 +199,6 @@ def test_our_lens_terms_are_those_of_mrcals_own_example(tmp_path):
     assert rig.baseline == pytest.approx(0.1)
 
 
-def fisheye(text, rig):
-    return text.replace("fisheye = false", "fisheye = true", 1)
-
-
 def third_camera(text, rig):
     return text + text.replace("[cameras.0]", "[cameras.5]").partition("[cameras.1]")[0]
 
@@ -239,7 +235,7 @@ SKEWED = [
         ("rig.cameramodel", lambda *_: "{'lensmodel': 'LENSMODEL_SPLINED_STEREOGRAPHIC'}", "SPLINED"),
         ("rig.cameramodel", lambda *_: "{'lensmodel': 'LENSMODEL_OPENCV5', 'intrinsics': [1, 2]}", "intrinsics"),
         ("rig.cameramodel", lambda *_: "import os", "not a .cameramodel"),
-        ("rig.toml", fisheye, "camera 0: a fisheye"),
+        ("rig.toml", lambda text, _: text.replace("fisheye = false", "fisheye = true", 1), "camera 0: a fisheye"),
         ("rig.toml", third_camera, "0, 1, 5; name two"),
         ("rig.toml", entry("distortions", '["a"]'), "camera 0.*'distortions' is missing, or not numbers"),
         ("rig.toml", entry("rotation", '"none"'), "camera 0.*'rotation' is missing, or not numbers"),

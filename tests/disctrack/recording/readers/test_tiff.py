@@ -25,16 +25,13 @@ def ours(content):
 
 def pictures():
     rng = np.random.default_rng(5)
-    noise = rng.normal(120, 3, (61, 83))
-    disc = np.where(np.hypot(*(np.mgrid[:61, :83] - 35)) < 20, 40.0, 200.0)
-    yield "noise", noise
-    yield "flat", np.full((61, 83), 7.0)
-    yield "disc", disc + (noise - 120) / 8
-    yield "white noise", rng.uniform(0, 255, (61, 83))
-    yield "a column", noise[:, :1]
+    noise, white = rng.normal(120, 3, (61, 83)), rng.uniform(0, 255, (61, 83))
+    disc = np.where(np.hypot(*(np.mgrid[:61, :83] - 35)) < 20, 40.0, 200.0) + (noise - 120) / 8
+    flat = np.full((61, 83), 7.0)
+    return {"noise": noise, "flat": flat, "disc": disc, "white noise": white, "a column": noise[:, :1]}
 
 
-PICTURES = dict(pictures())
+PICTURES = pictures()
 
 
 def picture(name, bits):
