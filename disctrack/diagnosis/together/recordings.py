@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.kit.arrays import Array
+from calibration.kit.threads import one_blas_thread
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.large_faults import large_faults
 from disctrack.diagnosis.model_file import PAPER, declared_model
@@ -26,10 +27,11 @@ from disctrack.trajectory import Trajectory
 Item = tuple[Recorded, Mapping[str, str], str]  # recording, its labels, the model
 
 
+@one_blas_thread
 def diagnose_together(
     recordings: Sequence[Recorded],
     model: str = PAPER,
-    processes: int = 1,
+    threads: int = 1,
     progress: Callable[[str], None] = lambda text: None,
     settle: bool = False,
     unread: Mapping[str, str] | None = None,
@@ -38,7 +40,7 @@ def diagnose_together(
 
     model : as for `diagnose`
     unread : further recordings that are reported as left out, with the reasons
-    processes : that share the recordings; the answer does not depend on their number
+    threads : that share the recordings; the answer does not depend on their number
     settle : also compute which further recording would answer the open questions
     Raises AnalysisError if fewer than two recordings can be used.
     """
@@ -46,9 +48,9 @@ def diagnose_together(
     items = [(recorded, label, model) for recorded, label in zip(recordings, labels, strict=True)]
     described = [(recorded.name, label) for recorded, label, _ in items]
     progress(f"{len(items)} recordings, each alone")
-    with Crew(DiscMember, items, processes) as crew:
-        answer = answer_together(crew, described, in_common, progress, unread or {})
-        return replace(answer, plan=_plan(answer, crew)) if settle else answer
+    crew = Crew(DiscMember, items, threads)
+    answer = answer_together(crew, described, in_common, progress, unread or {})
+    return replace(answer, plan=_plan(answer, crew)) if settle else answer
 
 
 def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:

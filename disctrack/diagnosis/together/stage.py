@@ -29,7 +29,7 @@ def run_together(
     overwrite: bool = False,
     reuse: bool = False,
     settle: bool = False,
-    processes: int = 1,
+    threads: int = 1,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Report:
     """Diagnose trajectory files together; write diagnosis.json and diagnosis.html with figures.
@@ -71,7 +71,7 @@ def run_together(
         replace(r, name=p.resolve().relative_to(common).as_posix()) if names.count(r.name) > 1 else r
         for p, r in read.items()
     ]
-    result = diagnose_together(recordings, model, processes=processes, progress=progress, settle=settle, unread=unread)
+    result = diagnose_together(recordings, model, threads=threads, progress=progress, settle=settle, unread=unread)
     document = {"files": [str(p) for p in paths], **as_json(result)}
     summary = replace(report_of(result, figures(result), (html, report)), data=document)
     files = write_page(html, summary, ["png"])
