@@ -20,6 +20,7 @@ from disctrack.discrepancy.joint.together import TogetherDiagnosis, answer_toget
 from disctrack.discrepancy.noise import inflation
 from disctrack.discrepancy.system import Values
 from disctrack.errors import AnalysisError
+from disctrack.files.json_text import json_text
 from disctrack.findings import Kind
 from disctrack.track.side_by_side import evenly
 from disctrack.trajectory import Trajectory
@@ -81,7 +82,7 @@ def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
 
 def labels_of(recordings: Sequence[Recorded]) -> list[dict[str, str]]:
     """Names of disc, surface, rig and air of every recording, different where these differ."""
-    keys = [_rig_key(r.trajectory) for r in recordings]
+    keys = [json_text(r.trajectory.rig) for r in recordings]
     rigs = {key: i + 1 for i, key in enumerate(dict.fromkeys(keys))}
     found = []
     for r, key in zip(recordings, keys, strict=True):
@@ -90,14 +91,6 @@ def labels_of(recordings: Sequence[Recorded]) -> list[dict[str, str]]:
         labels = {"disc": r.disc or sizes, "surface": r.surface, "rig": f"rig {rigs[key]}"}
         found.append(labels | {"air": f"{_density(r.trajectory):g} kg/m^3"})
     return found
-
-
-def _rig_key(trajectory: Trajectory) -> bytes:
-    """Equal for recordings with the same calibration."""
-    rig = trajectory.rig
-    cameras = np.array([(c.fx, c.fy, c.cx, c.cy, *c.distortion) for c in rig.cameras])
-    parts = [cameras, rig.R_right_left, rig.t_right_left, rig.R_left_world, rig.t_left_world, rig.covariance]
-    return np.concatenate([np.ravel(part) for part in parts]).tobytes()
 
 
 def _density(trajectory: Trajectory) -> float:
