@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space, solve_toeplitz, solve_triangular
 from scipy.optimize import minimize
 from scipy.signal import lfilter
+from scipy.stats import norm
 
 from calibration.kit.arrays import Array, Mask
 from disctrack.discrepancy.elimination import Own, is_linear, projection
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from disctrack.discrepancy.equations.declared import Samples
 
 MARGIN = 1.5  # over the largest eigenvalue of independent noise (Marchenko and Pastur's edge)
+OUTLIER = 8.0  # standard deviations
 THIRD = 2.31  # samples per independent one among third differences: 1 + 2 (15^2 + 6^2 + 1) / 20^2
 
 
@@ -225,6 +227,11 @@ def _log_likelihood(s: SampleStretch, Q: Array, noise: SmoothNoise) -> float:
     root = np.linalg.cholesky(Q @ K @ Q.T)
     white = solve_triangular(root, Q @ s.values, lower=True)
     return -0.5 * float(np.sum(white**2)) - s.values.shape[1] * float(np.sum(np.log(np.diag(root))))
+
+
+def far_off(residuals: Array) -> float:
+    """Size above which a residual is an outlier, from the median of all sizes, to which outliers do not matter."""
+    return OUTLIER * float(np.nanmedian(np.abs(residuals)) / norm.ppf(0.75))
 
 
 _ORDERS = range(2, 7)  # of differences: higher ones suppress more of the motion

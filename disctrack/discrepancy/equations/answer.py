@@ -20,6 +20,7 @@ from disctrack.discrepancy.equations.law import NAME, LearnedForce
 from disctrack.discrepancy.equations.loop import find_missing
 from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.noise import OUTLIER, far_off
 from disctrack.discrepancy.search import Diagnosis, Settings, Verdict
 from disctrack.discrepancy.significance import LAGS, ljung_box, ljung_box_p_value
 from disctrack.discrepancy.system import Candidate, System
@@ -34,7 +35,7 @@ from disctrack.report.terminal import full
 if TYPE_CHECKING:
     from disctrack.report.figures import Drawn
 
-OUTLIER, FEW = 8.0, 0.02  # standard deviations of an outlier; share of the samples, above which it is the noise
+FEW = 0.02  # share of the samples, above which outliers are the noise
 ODD = 2.0  # rms over the median of all runs, above which one is odd
 FAR_OFF = 10.0  # sigmas, or factor, by which a fitted parameter differs from its declared value
 
@@ -187,7 +188,7 @@ class Answer:
         predicted = self.predicted(self.diagnosis.after)
         for c, channel in enumerate(self.system.formulas.channels):
             left = [np.abs(s.data[:, c] - seen[:, c]) for s, seen in predicted]
-            limit = OUTLIER * float(np.nanmedian(np.concatenate(left)) / stats.norm.ppf(0.75))
+            limit = far_off(np.concatenate(left))
             off = [(s.run, float(t)) for (s, _), r in zip(predicted, left, strict=True) for t in s.time[r > limit]]
             if limit > 0 and 0 < len(off) < FEW * sum(np.isfinite(r).sum() for r in left):
                 some = ", ".join(f"{run} at {t:.4g} s" for run, t in off[:4]) + (", ..." if len(off) > 4 else "")

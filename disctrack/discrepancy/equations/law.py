@@ -25,7 +25,7 @@ from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem
 from disctrack.discrepancy.fit import TRIAL, Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
-from disctrack.discrepancy.noise import with_autocorrelation
+from disctrack.discrepancy.noise import far_off, with_autocorrelation
 from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import (
     CLASS_GAIN,
@@ -45,16 +45,13 @@ from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, V
 NAME = "learned"  # of the term
 HARMONICS = (24, 8)  # highest wave number of a law of one variable, and of two
 MARGIN = 0.2  # of the visited range, added at both ends: cosines have zero slope at the ends of their interval
-SMOOTH = (0.7, 1.5, 3.0, 6.0)  # wave numbers above which amplitudes fall ...
-FALLS = (1.5, 1.0)  # ... as these powers of 1 + (wave number over it) squared: smooth, and with kinks
-FINE, STRAIGHT = 0.03, 1e4  # scale of the variable's asinh over its largest value: finer near zero, or linear
+SMOOTH = (0.7, 1.5, 3.0, 6.0)  # wave numbers above which amplitudes fall as the inverse square
 SIZES = np.logspace(-4, 2, 31)  # prior sigma of the first amplitudes over the rms of their equation
 MOST_LAWS = 40  # above which a law depends on variables of its own equation only
 REFITTED = 4  # laws that are fitted in full
 WORTH = 50.0  # of first-order -2 log evidence over the best law, up to which a law is fitted ...
 ROUGHLY = 4.0  # ... over this multiple of the best, where the declared equations are far from the data
 PLAUSIBLE = 4.0  # of -2 log evidence: a rougher prior may be less probable by so much
-ROUNDS = 3  # alternations of fitting the law and its prior
 POINTS = (61, 400)  # of the reported course, for one and two variables
 
 
@@ -65,7 +62,6 @@ class Along:
     equation: str  # state of the equation
     variables: tuple[str, ...]  # one or two states or inputs; or "t" alone
     jumps: bool = False  # with the sign of the variable, as friction does
-    fine: bool = False  # with a finer resolution near zero, as for drag that falls with speed
 
     @property
     def title(self) -> str:
@@ -247,7 +243,6 @@ class _Competition:
         self.system, self.diagnosis, self.noise = system, diagnosis, diagnosis.noise
         self._judged = judged
         base = diagnosis.before
-        self.declared = {q.name: q.null for q in system.base if not q.is_initial}
         self.begin = dict(base.values)
         chi_square = float(np.sum(system.linearise(self.begin, [])[0] ** 2))
         self.far = not chi_square < FAR * self.noise * max(float(np.sum(system.weights)), 1.0)
@@ -264,9 +259,11 @@ class _Competition:
         """Is the promised gain insignificant? Along directions that only the prior determines, steps never end."""
         return fitted.converged or fitted.promised < CLASS_GAIN * self.noise
 
-    def at_noise(self, fitted: Fit) -> bool:
-        """As in the search."""
-        return self.has_converged(fitted) and is_noise(fitted, self.diagnosis.settings, self.noise)
+    def at_noise(self, system: System, fitted: Fit) -> bool:
+        """As in the search; and does the law follow every sample? The noise may be too large by the few it does not."""
+        size = np.abs(system.linearise(fitted.values, [])[0])
+        follows = not size.max() > far_off(size[size > 0])  # missing data have zeros
+        return follows and self.has_converged(fitted) and is_noise(fitted, self.diagnosis.settings, self.noise)
 
     def known_terms(self) -> list[Candidate]:
         """Known terms that may act with a law: those of the shortest explanations."""
@@ -293,7 +290,8 @@ class _Competition:
         first = self.shots[0]
         values = self.begin
         if self.far:
-            values = self.begin | self.declared | shooting.initial_guess(first)[0]
+            declared = {q.name: q.null for q in first.base if not q.is_initial}
+            values = self.begin | declared | shooting.initial_guess(first)[0]
             values = fit(first, [shooting.with_weak_prior(q) for q in first.base], values, TRIAL).values
         scans = []
         for law in self.laws:
@@ -341,8 +339,8 @@ class _Competition:
         size, root, found = shooting.scales(system, values).get(own[0].name, 1.0), np.sqrt(self.noise), []
         basis = _basis(len(law.variables))
         waves = np.array([basis[q.part][1] for q in own])
-        for smooth, fall in product(SMOOTH, FALLS):
-            falls = (1.0 + (waves / smooth) ** 2) ** -fall  # prior sigma of each amplitude over that of the first
+        for smooth in SMOOTH:
+            falls = 1.0 / (1.0 + (waves / smooth) ** 2)  # prior sigma of each amplitude over that of the first
             # the faster driver may fail for nearly equal columns
             U, singular, _ = linalg.svd(columns * falls, full_matrices=False, lapack_driver="gesvd")
             lengths = evidence(size * singular / root, U.T @ right / root, SIZES)
@@ -364,38 +362,23 @@ class _Competition:
     ) -> LearnedForce | None:
         """The law fitted by multiple shooting, over longer and longer stretches; None where it loses the data."""
         first, numbers = _set(self.shots[0], law, values)
-        now, evident = dict(values) | {q.name: 0.0 for q in own} | numbers, np.inf
-        for system, longer in zip(self.shots, [*self.shots[1:], None], strict=True):
+        now = dict(values) | {q.name: 0.0 for q in own} | numbers
+        for system in self.shots:
             there = replace(system, widths=first.widths)
-            others, view = self._others(there, known), there if longer else self.view(there)
-            for _ in range(1 if longer else ROUNDS):
-                fitted = self._fitted(view, (*others, *own), now)
-                if not fitted.reduced_chi_square < FAR * self.noise:  # longer stretches leave more
-                    return None
-                before, now = evident, dict(fitted.values)
-                evident, own = self._evidence(there, law, known, now)
-                if abs(before - evident) < 1.0:
-                    break
-        fitted = self._fitted(view, (*others, *own), now)
+            others, view = self._others(there, known), self.view(there) if system is self.shots[-1] else there
+            fitted = fit(view, (*others, *own), now, TRIAL)
+            if not fitted.reduced_chi_square < FAR * self.noise:  # longer stretches leave more
+                return None
+            now = dict(fitted.values)
+            evident, own = self._evidence(there, law, known, now)
+        fitted = fit(view, (*others, *own), now, TRIAL)
         # declared parameters and known terms have their usual penalties; that of the law is part of the evidence
         penalties = length(view, self.diagnosis.settings, self.noise, fitted, known) - fitted.cost / self.noise
         there = _set(self.system, law, fitted.values)[0]
         return LearnedForce(
             (*known, _candidate(law, own)), fitted, length=evident + penalties, along=law, instead=self.instead,
-            at_noise=self.at_noise(fitted), noise=self.noise, system=there, judged=self.view(there),
+            at_noise=self.at_noise(view, fitted), noise=self.noise, system=there, judged=self.view(there),
         )  # fmt: skip
-
-    def _fitted(self, system: System, quantities: Sequence[Quantity], values: Values) -> Fit:
-        """The Gauss-Newton fit; within a trust region where that does not converge near the data.
-
-        Poorly determined amplitudes may take large first-order steps, which shift the phase to second order.
-        """
-        found = fit(system, quantities, values, TRIAL)
-        # after the full step, to first order
-        ahead = (found.chi_square - found.promised) / max(found.degrees_of_freedom, 1)
-        if self.has_converged(found) or not ahead < FAR * self.noise:
-            return found
-        return fit(system, quantities, shooting.trust_region(system, quantities, found.values), TRIAL)
 
 
 def _laws(system: EquationSystem, values: Values, n: int) -> Iterator[Along]:
@@ -414,10 +397,9 @@ def _laws(system: EquationSystem, values: Values, n: int) -> Iterator[Along]:
             if many and not there.issuperset(variables):
                 continue
             yield Along(equation, variables)
-            if n == 1 and variables[0] in {equation, *velocities}:
-                yield Along(equation, variables, fine=True)
-                if {-1.0, 1.0} <= set(np.sign(_visited(system, variables, values)[:, 0]).tolist()):
-                    yield Along(equation, variables, jumps=True)
+            velocity = n == 1 and variables[0] in {equation, *velocities}
+            if velocity and {-1.0, 1.0} <= set(np.sign(_visited(system, variables, values)[:, 0]).tolist()):
+                yield Along(equation, variables, jumps=True)
 
 
 def _forced(equations: Equations) -> list[str]:
@@ -434,10 +416,9 @@ def _knowing(system: EquationSystem, channels: Mapping[str, Formula], n: int) ->
     for i in range(n):
         own = f"{NAME}_{i}"
         words[f"x{i}"] = "(" + " + ".join(f"{own}_of_{name}*{name}" for name in (*e.states, *e.inputs, "t")) + ")"
-        words[f"r{i}"] = f"{own}_reach"
-        words[f"p{i}"] = f"({own}_bend*asinh({words[f'x{i}']}/{own}_bend) - {own}_from)/{own}_span"
+        words[f"p{i}"] = f"({words[f'x{i}']} - {own}_from)/{own}_span"
         constants |= dict.fromkeys([f"{own}_of_{name}" for name in (*e.states, *e.inputs, "t")] + [f"{own}_from"], 0.0)
-        constants |= dict.fromkeys([f"{own}_span", f"{own}_reach", f"{own}_bend"], 1.0)
+        constants[f"{own}_span"] = 1.0
     course = " + ".join(f"own_{name}*{formula.format(**words)}" for name, (formula, _) in _basis(n).items())
     term = Term(
         NAME, {s: f"{NAME}_on_{s}*({course})" for s in _forced(e)},
@@ -460,7 +441,7 @@ def _basis(n: int) -> dict[str, tuple[str, float]]:
         cosines = [f"cos({k}*pi*{{p{i}}})" for i, k in enumerate(waves) if k]
         if (number := float(np.linalg.norm(waves))) <= most:
             found["a" + "_".join(map(str, waves))] = "*".join(cosines) or "1", number
-    found |= {f"slope{i or ''}": (f"{{x{i}}}/{{r{i}}}", 0.0) for i in range(n)}
+    found |= {f"slope{i or ''}": (f"(2*{{p{i}}} - 1)", 0.0) for i in range(n)}
     return found if n > 1 else found | {"jump": ("sign({x0})", 0.0)}
 
 
@@ -480,12 +461,8 @@ def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSy
     numbers[f"{NAME}_on_{law.equation}"] = 1.0
     visited = _visited(system, law.variables, values)
     for i, (variable, x) in enumerate(zip(law.variables, visited.T, strict=True)):
-        reach = max(float(np.abs(x).max()), 1e-12)
-        bend = reach * (FINE if law.fine else STRAIGHT)
-        low, high = (float(bend * np.arcsinh(end / bend)) for end in (x.min(), x.max()))
-        span = max(high - low, 1e-12 * reach)
-        own = {f"of_{variable}": 1.0, "from": low - MARGIN * span, "span": (1 + 2 * MARGIN) * span}
-        own |= {"reach": reach, "bend": bend}
+        span = max(float(np.ptp(x)), 1e-12 * max(float(np.abs(x).max()), 1e-12))
+        own = {f"of_{variable}": 1.0, "from": float(x.min()) - MARGIN * span, "span": (1 + 2 * MARGIN) * span}
         numbers |= {f"{NAME}_{i}_{n}": x for n, x in own.items()}
     of = f"{NAME}_0_of_"
     mine = [w.name for a, w in system.formulas.widths.items() if any(s.name.startswith(of) for s in a.free_symbols)]
