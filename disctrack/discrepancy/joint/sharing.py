@@ -14,8 +14,9 @@ import numpy as np
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import eliminate
 from disctrack.discrepancy.elimination import is_linear, prior_rows, projection
-from disctrack.discrepancy.fit import fit
-from disctrack.discrepancy.joint.crew import Crew
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.joint.side_by_side import side_by_side
+from disctrack.discrepancy.noise import inflation
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
 EACH = "each its own"  # mark of candidates with an amount for each group
@@ -25,13 +26,11 @@ LAWS = ("surface", "air")  # whose laws may have the same constant for another d
 
 @dataclass(frozen=True)
 class Member:
-    """Description of one recording, without its data."""
+    """One recording, fitted alone."""
 
     name: str
-    base: tuple[Quantity, ...]
-    candidates: tuple[Candidate, ...]
-    start: Mapping[str, float]  # base quantities, as fitted to this recording alone
-    n_data: int
+    system: System
+    start: Values  # of base quantities, as fitted to this recording alone, and of those that are held
     labels: Mapping[str, str]  # "disc", "surface", "rig", "air" -> its name
     covariates: Mapping[str, float] = field(default_factory=dict)  # declared: "mass", "radius", ... in SI
 
@@ -49,7 +48,7 @@ class Sharing:
         # of each member: shared name -> its quantity, whose difference from null is the sum of theirs
         self.local: list[dict[str, str]] = [{} for _ in members]
         for i, member in enumerate(members):
-            for q in member.base:
+            for q in member.system.base:
                 self._base_quantity(i, q)
         self.candidates = self._all_candidates()
         self.own = tuple(tuple(own) for own in self._own)  # of each member, the base quantities that it does not share
@@ -113,7 +112,7 @@ class Sharing:
     def _all_candidates(self) -> tuple[Candidate, ...]:
         by_name: dict[str, dict[int, Candidate]] = {}
         for i, member in enumerate(self.members):
-            for c in member.candidates:
+            for c in member.system.candidates:
                 if not (c.threshold or c.sought) and all(q.belongs_to for q in c.quantities):
                     by_name.setdefault(c.name, {})[i] = c
         return tuple(variant for having in by_name.values() for variant in self._variants(having))
@@ -173,22 +172,22 @@ class Reduction:
     """A system with some base quantities profiled out: they always have their best values."""
 
     def __init__(self, system: System, own: Sequence[Quantity], start: Values) -> None:
-        """Own : quantities without bounds.   start : their initial values."""
-        self.system, self.own = system, tuple(own)
+        """Own : quantities without bounds.   start : their initial values, and those of quantities that are held."""
+        self.system, self.own, self._start = system, tuple(own), start
         self.moved = [q for q in own if not is_linear(q)]
         self._first = self.own_values = {q.name: start.get(q.name, q.null) for q in self.moved}
 
     def reduce(self, shared: Values, names: Sequence[str]) -> Reduced | None:
         """The problem in the shared quantities `names`, at the values `shared`; None where there is no prediction."""
         for start in (self.own_values, self._first):  # from the latest values, or else from the first ones
-            found = fit(self.system, self.own, {**shared, **start})
+            found = fit(self.system, self.own, {**self._start, **shared, **start})
             if found.converged:
                 self.own_values = {name: found.values[name] for name in start}
                 return self._eliminated(shared, names)
         return None
 
     def _eliminated(self, shared: Values, names: Sequence[str]) -> Reduced | None:
-        values = {**shared, **self.own_values}
+        values = {**self._start, **shared, **self.own_values}
         common = projection(self.system, self.own, values)
         values |= dict(zip(common.names, common.null.tolist(), strict=True))
         residual, derivative = self.system.linearise(values, [*self.own_values, *names])
@@ -204,21 +203,23 @@ class Reduction:
 class JointSystem(System):
     """Recordings that share quantities. A row is the reduced least-squares problem of a recording."""
 
-    def __init__(self, sharing: Sharing, crew: Crew) -> None:
-        """Crew : of the members of the sharing, each with a method `reduce` (`Reduction`)."""
-        self.sharing, self._crew = sharing, crew
-        n = len(sharing.members)
+    def __init__(self, sharing: Sharing, threads: int = 1) -> None:
+        """Threads : in which the recordings are worked on side by side."""
+        self.sharing, self._threads = sharing, threads
+        n, each = len(sharing.members), list(zip(sharing.members, sharing.own, strict=True))
         self.time: Array = np.arange(n, dtype=float)
         free = [sum(not np.isfinite(q.prior_sigma) for q in own) for own in sharing.own]
-        self.weights: Array = np.array([m.n_data - k for m, k in zip(sharing.members, free, strict=True)], float)
+        self.weights: Array = np.array([np.sum(m.system.weights) for m in sharing.members]) - free
         self.base: tuple[Quantity, ...] = tuple(sharing.base.values())
         self.candidates: tuple[Candidate, ...] = sharing.candidates
+        self._reductions = [Reduction(m.system, own, m.start) for m, own in each]
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Rows (n, w) of the reduced problems, padded with zeros, and their derivatives (n, w, k)."""
         sharing, n = self.sharing, len(self.time)
         local = [sharing.local_names(i, names) for i in range(n)]
-        found = self._crew.call("reduce", [(sharing.local_values(i, values), local[i]) for i in range(n)])
+        each = [(r, sharing.local_values(i, values), local[i]) for i, r in enumerate(self._reductions)]
+        found = side_by_side(Reduction.reduce, each, self._threads)
         reduced = {i: each for i, each in enumerate(found) if isinstance(each, tuple)}
         width = max([1, *(len(right) for right, _ in reduced.values())])
         residual, derivative = np.full((n, width), np.nan), np.zeros((n, width, len(names)))
@@ -229,3 +230,28 @@ class JointSystem(System):
                 if name in sharing.local[i]:
                     derivative[i, : len(right), column] = matrix[:, local[i].index(sharing.local[i][name])]
         return residual, derivative
+
+    def local_start(self, i: int, shared: Values) -> dict[str, float]:
+        """Values of the quantities of recording i at these shared ones."""
+        start, own = self.sharing.members[i].start, self._reductions[i].own_values
+        return {**start, **own, **self.sharing.local_values(i, shared)}
+
+    def local_quantities(self, i: int, names: Sequence[str]) -> tuple[Quantity, ...]:
+        """Base quantities of recording i, and those of its candidates to which these shared ones contribute."""
+        system, local = self.sharing.members[i].system, self.sharing.local_names(i, names)
+        known = {q.name: q for c in system.candidates for q in c.quantities}
+        return *system.base, *(known[n] for n in local if n in known)
+
+    def alone(self, names: Sequence[str], shared: Values) -> list[Any]:
+        """Each recording fitted alone with these quantities of candidates, beginning at the shared solution.
+
+        Two fits, or an error: in the second one the standard deviations allow for the autocorrelation of the residuals.
+        """
+
+        def fitted(i: int) -> tuple[Fit, Fit]:
+            system = self.sharing.members[i].system
+            found = fit(system, self.local_quantities(i, names), self.local_start(i, shared))
+            growth = inflation(system, found)
+            return found, replace(found, covariance=found.covariance * np.outer(growth, growth))
+
+        return side_by_side(fitted, [(i,) for i in range(len(self.time))], self._threads)

@@ -16,7 +16,6 @@ from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.covariates import Hypothesis, hypotheses
-from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.fitting_in import Blocks, ConsistencyTest, inconsistent
 from disctrack.discrepancy.joint.sharing import EACH, JointSystem, Member, Sharing
 from disctrack.discrepancy.score import Linearisation, score_all, sigmas, span
@@ -81,51 +80,41 @@ class TogetherDiagnosis:
 
 
 def answer_together(
-    crew: Crew,
     described: Sequence[tuple[str, Mapping[str, str]]],
-    in_common: Callable[[list[Any]], list[Any]],
+    members: Sequence[Member | DiscTrackError],
+    threads: int,
     progress: Callable[[str], None],
     unread: Mapping[str, str],
 ) -> TogetherDiagnosis:
-    """Joint diagnosis of all recordings of the crew.
+    """Joint diagnosis of recordings.
 
-    crew : objects with the methods `summary`, `with_common` (a Member), `share`, `reduce` and `alone` (a Fit, and the
-        same with sigmas that allow for autocorrelated residuals)
     described : name and labels of each
-    in_common : arguments of `with_common` for all recordings, by their summaries: errors that they share
+    members : each, or why it cannot be used
+    threads : that share the recordings
     unread : further recordings that are reported as left out, and why
-    The crew keeps the recordings that were used.
     Raises AnalysisError where fewer than two can be used.
     """
     settings = Settings(noise=1.0)
     names, n = [name for name, _ in described], len(described)
-    summaries = crew.call("summary", [()] * n)
-    reasons = {i: str(s) for i, s in enumerate(summaries) if isinstance(s, DiscTrackError)}
-    kept = [i for i in range(n) if i not in reasons]
-    crew.keep(kept)
-    refitted = crew.call("with_common", [(s,) for s in in_common([summaries[i] for i in kept])])
-    reasons |= {i: str(m) for i, m in zip(kept, refitted, strict=True) if isinstance(m, DiscTrackError)}
-    members: list[Member] = [m for m in refitted if not isinstance(m, DiscTrackError)]
-    kept = [i for i in kept if i not in reasons]
+    usable = {i: m for i, m in enumerate(members) if isinstance(m, Member)}
+    reasons = {i: str(m) for i, m in enumerate(members) if i not in usable}
     unusable = (*(names[i] for i in reasons), *unread)
     while True:
+        kept = [i for i in range(n) if i not in reasons]
         if len(kept) < 2:
             left_out = {names[i]: reason for i, reason in reasons.items()} | dict(unread)
             said = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:5])
             raise AnalysisError(f"fewer than two recordings can be diagnosed together. {said}")
-        crew.keep(kept)
-        system, diagnosis = _search(members, crew, settings, progress)
-        most = len(members) - (2 * n + 2) // 3
+        system, diagnosis = _search([usable[i] for i in kept], threads, settings, progress)
+        most = len(kept) - (2 * n + 2) // 3
         effects = [c for c in system.candidates if not c.name.endswith(f"({EACH})")]
         out = inconsistent(system, diagnosis.after, settings.false_alarm, most, effects)
         if not out:
             break
         for k, effect in out.items():
             reasons[kept[k]] = "does not fit the others" + (f"; it differs most by: {effect}" if effect else "")
-        members = [m for k, m in enumerate(members) if k not in out]
-        kept = [i for k, i in enumerate(kept) if k not in out]
     progress("each recording against the others")
-    diagnosis, alone = _with_autocorrelation(system, diagnosis, crew)
+    diagnosis, alone = _with_autocorrelation(system, diagnosis)
     blocks = Blocks(system, diagnosis.after)
     judged = {kept[k]: (blocks.consistency(k, others), alone[k]) for k, others in blocks.others(range(len(kept)))}
     by_recording = (
@@ -140,15 +129,13 @@ def answer_together(
 
 
 def _search(
-    members: Sequence[Member], crew: Crew, settings: Settings, progress: Callable[[str], None]
+    members: Sequence[Member], threads: int, settings: Settings, progress: Callable[[str], None]
 ) -> tuple[JointSystem, Diagnosis]:
-    sharing = Sharing(members)
-    crew.call("share", [([q.name for q in own],) for own in sharing.own])
-    system = JointSystem(sharing, crew)
+    system = JointSystem(Sharing(members), threads)
     progress(f"{len(members)} recordings together: {len(system.base)} shared quantities")
     n = len(members)
     training = np.arange(n) % TEST_EVERY != TEST_EVERY - 1 if n >= TEST_EVERY else np.arange(n) == 0
-    return system, _without_variants(explain(system, sharing.start(), settings, training))
+    return system, _without_variants(explain(system, system.sharing.start(), settings, training))
 
 
 def _without_variants(diagnosis: Diagnosis) -> Diagnosis:
@@ -162,14 +149,11 @@ def _without_variants(diagnosis: Diagnosis) -> Diagnosis:
     return replace(diagnosis, found=tuple(found))
 
 
-def _with_autocorrelation(system: JointSystem, diagnosis: Diagnosis, crew: Crew) -> tuple[Diagnosis, list[Fit | None]]:
+def _with_autocorrelation(system: JointSystem, diagnosis: Diagnosis) -> tuple[Diagnosis, list[Fit | None]]:
     """With sigmas that allow for autocorrelated residuals; and the fit of each recording alone."""
     after, sharing = diagnosis.after, system.sharing
     extra = [n for f in diagnosis.found for n in f.candidate.names]
-    requested = [
-        (sharing.local_values(i, after.values), sharing.local_names(i, extra)) for i in range(len(sharing.members))
-    ]
-    alone = [None if isinstance(a, DiscTrackError) else a for a in crew.call("alone", requested)]
+    alone = [None if isinstance(a, DiscTrackError) else a for a in system.alone(extra, after.values)]
     fitted = [(i, *fits) for i, fits in enumerate(alone) if fits is not None and fits[0].converged]
     growth = np.ones(len(after.quantities))
     for k, q in enumerate(after.quantities):

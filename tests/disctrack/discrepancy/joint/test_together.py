@@ -12,19 +12,16 @@ from numpy.testing import assert_allclose
 
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.joint.covariates import equivalent, hypotheses
-from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.fitting_in import Blocks, inconsistent
 from disctrack.discrepancy.joint.sharing import JointSystem, Sharing
+from disctrack.discrepancy.joint.side_by_side import side_by_side
 from disctrack.discrepancy.search import Settings, explain
 from disctrack.errors import AnalysisError
-from tests.oracles.decaying_runs import DecayMember, fitted_at_once, runs
+from tests.oracles.decaying_runs import fitted_at_once, member, runs
 
 
 def joint(items, threads=1):
-    crew = Crew(DecayMember, items, threads)
-    sharing = Sharing([DecayMember(item).member for item in items])
-    crew.call("share", [([q.name for q in own],) for own in sharing.own])
-    return JointSystem(sharing, crew)
+    return JointSystem(Sharing([member(item) for item in items]), threads)
 
 
 def answer(items):
@@ -244,9 +241,9 @@ def test_ctrl_c_waits_for_no_recording(tmp_path, threads):
     script = tmp_path / "script.py"
     script.write_text(
         "import time\n"
-        "from disctrack.discrepancy.joint.crew import Crew\n"
+        "from disctrack.discrepancy.joint.side_by_side import side_by_side\n"
         "def begin(item):\n    print(item, flush=True)\n    time.sleep(100)\n"
-        f"Crew(begin, range(2), {threads})\n"
+        f"side_by_side(begin, [(0,), (1,)], {threads})\n"
     )
     running = subprocess.Popen([sys.executable, script], env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True,
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)  # fmt: skip
@@ -260,8 +257,7 @@ def test_ctrl_c_waits_for_no_recording(tmp_path, threads):
 
 
 def test_a_run_that_cannot_be_prepared_is_an_error_in_its_place(rng):
-    crew = Crew(DecayMember, [*runs(rng, 1), None])
-    good, bad = crew.call("share", [(["state.a", "state.b"],)] * 2)
-    assert good is None
+    good, bad = side_by_side(member, [(item,) for item in (*runs(rng, 1), None)])
+    assert good.name == "run 0"
     assert isinstance(bad, AnalysisError)
     assert "TypeError" in str(bad)
