@@ -49,23 +49,25 @@ def diagnose_together(
     each = [(*described[i], found[i], systematic) for i, systematic in zip(good, common, strict=True)]
     for i, member in zip(good, side_by_side(_alone, each, threads), strict=True):
         found[i] = member
-    answer = answer_together(described, found, threads, progress, unread or {})
+    for name, reason in (unread or {}).items():
+        described.append((name, {}))
+        found.append(AnalysisError(reason))
+    answer = answer_together(described, found, threads, progress)
     return replace(answer, plan=_plan(answer)) if settle else answer
 
 
 def _plan(answer: TogetherDiagnosis) -> Plan | None:
     """Further recordings, with disc, surface and cameras of the longest one."""
-    system, diagnosis = answer.system, answer.diagnosis
-    sharing, after = system.sharing, diagnosis.after
+    system, diagnosis, after = answer.system, answer.diagnosis, answer.diagnosis.after
     longest = int(np.argmax(system.weights))
-    local = {c.name for c in sharing.members[longest].system.candidates}
+    local = {c.name for c in system.members[longest].system.candidates}
     questions = open_questions(diagnosis, [b for b in answer.bounds if b.candidate.name in local])
     questions = tuple(question for question in questions if {c.name for c in question} <= local)
     if not questions:
         return None
     tested = [q for question in questions for c in question for q in c.quantities]
     everything = {q.name: q for q in (*tested, *after.quantities)}
-    parts = reversed(sharing.local[longest].items())  # of a sum of shared quantities the first one is kept
+    parts = reversed(system.local[longest].items())  # of a sum of shared quantities the first one is kept
     names = {there: shared for shared, there in parts if shared in everything}
     others = [q for n, q in everything.items() if n not in set(names.values())]
     values = {n: q.null for n, q in everything.items()} | after.values
@@ -74,7 +76,7 @@ def _plan(answer: TogetherDiagnosis) -> Plan | None:
         return None
     extra, start = [n for f in diagnosis.found for n in f.candidate.names], system.local_start(longest, after.values)
     fitted = no_fit(system.local_quantities(longest, extra), start)
-    of_disc = sharing.members[longest].system
+    of_disc = system.members[longest].system
     # an error where no motion can be planned
     (found,) = side_by_side(plan, [(of_disc, fitted, questions, 1.0, (tuple(names), known[1]))])
     return found if isinstance(found, Plan) else None

@@ -9,7 +9,8 @@ from disctrack.diagnosis.model_file import PAPER
 from disctrack.diagnosis.recorded import Recorded, read_recorded
 from disctrack.diagnosis.together.output import as_json, figures, report_of
 from disctrack.diagnosis.together.recordings import diagnose_together
-from disctrack.errors import AnalysisError, TrajectoryFileError
+from disctrack.discrepancy.joint.side_by_side import side_by_side
+from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import refuse_existing, write_whole
@@ -51,7 +52,7 @@ def run_together(
     folder = Path(output) if output is not None else common / FOLDER
     report, html = folder / "diagnosis.json", folder / "diagnosis.html"
     progress("reading")
-    read, unread = _read(paths)
+    read, unread = _read(paths, threads)
     if not read:
         raise AnalysisError("; ".join(f"{path}: {reason}" for path, reason in unread.items()))
     inputs = {
@@ -80,14 +81,11 @@ def run_together(
     return summary
 
 
-def _read(paths: Sequence[Path]) -> tuple[dict[Path, Recorded], dict[str, str]]:
+def _read(paths: Sequence[Path], threads: int) -> tuple[dict[Path, Recorded], dict[str, str]]:
     """Recordings by file, and why others cannot be read: one broken file does not stop the diagnosis of the rest."""
-    read, unread = dict[Path, Recorded](), dict[str, str]()
-    for path in paths:
-        try:
-            read[path] = read_recorded(path)
-        except TrajectoryFileError as error:
-            if not path.is_file():  # mistyped
-                raise
-            unread[str(path)] = str(error).removeprefix(f"{path}: ")
-    return read, unread
+    found = dict(zip(paths, side_by_side(read_recorded, [(path,) for path in paths], threads), strict=True))
+    for path, recorded in found.items():
+        if not path.is_file():  # mistyped
+            raise recorded
+    read = {path: recorded for path, recorded in found.items() if isinstance(recorded, Recorded)}
+    return read, {str(path): str(e).removeprefix(f"{path}: ") for path, e in found.items() if path not in read}

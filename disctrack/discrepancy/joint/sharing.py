@@ -1,4 +1,4 @@
-"""Shared quantities of many recordings, and the joint system of all recordings.
+"""The joint system of many recordings: shared quantities, and what each recording knows of them.
 
 For the search, many recordings are one system, whose samples are recordings. The own quantities of a recording (its
 initial state) are eliminated; what remains is a least-squares problem in the shared quantities alone, a few dozen rows
@@ -35,23 +35,59 @@ class Member:
     covariates: Mapping[str, float] = field(default_factory=dict)  # declared: "mass", "radius", ... in SI
 
 
-class Sharing:
-    """Shared quantities of recordings, their candidates, and the corresponding quantities of each member."""
+class Reduction:
+    """A system with some base quantities profiled out: they always have their best values."""
 
-    def __init__(self, members: Sequence[Member]) -> None:
-        """Members : in the order of the recordings."""
-        self.members = tuple(members)
-        self.base: dict[str, Quantity] = {}
+    def __init__(self, system: System, own: Sequence[Quantity], start: Values) -> None:
+        """Own : quantities without bounds.   start : their initial values, and those of quantities that are held."""
+        self.system, self.own, self._start = system, tuple(own), start
+        self.moved = [q for q in own if not is_linear(q)]
+        self._first = self.own_values = {q.name: start.get(q.name, q.null) for q in self.moved}
+
+    def reduce(self, shared: Values, names: Sequence[str]) -> Reduced | None:
+        """The problem in the shared quantities `names`, at the values `shared`; None where there is no prediction."""
+        for start in (self.own_values, self._first):  # from the latest values, or else from the first ones
+            found = fit(self.system, self.own, {**self._start, **shared, **start})
+            if found.converged:
+                self.own_values = {name: found.values[name] for name in start}
+                return self._eliminated(shared, names)
+        return None
+
+    def _eliminated(self, shared: Values, names: Sequence[str]) -> Reduced | None:
+        values = {**self._start, **shared, **self.own_values}
+        common = projection(self.system, self.own, values)
+        values |= dict(zip(common.names, common.null.tolist(), strict=True))
+        residual, derivative = self.system.linearise(values, [*self.own_values, *names])
+        stacked = np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)])
+        if not np.isfinite(stacked).all():
+            return None
+        prior, matrix = prior_rows(self.moved, values)
+        known = np.column_stack([matrix, np.zeros((len(prior), len(names))), prior])
+        _, left = eliminate(np.concatenate([common.cleared(stacked), known]), len(self.moved))
+        return left[:, -1], left[:, :-1]
+
+
+class JointSystem(System):
+    """Recordings that share quantities. A row is the reduced least-squares problem of a recording."""
+
+    def __init__(self, members: Sequence[Member], threads: int = 1) -> None:
+        """Members : in the order of the recordings.   threads : in which they are worked on side by side."""
+        self.members, self._threads = tuple(members), threads
+        self._shared: dict[str, Quantity] = {}
         self._groups: dict[str, dict[str, str]] = {}  # quantity of a law -> group -> shared name
         self._nulls: dict[str, float] = {}
-        self._own: list[list[Quantity]] = [[] for _ in members]
+        own: list[list[Quantity]] = [[] for _ in members]  # of each member, the base quantities that it does not share
         # of each member: shared name -> its quantity, whose difference from null is the sum of theirs
         self.local: list[dict[str, str]] = [{} for _ in members]
         for i, member in enumerate(members):
-            for q in member.system.base:
-                self._base_quantity(i, q)
+            own[i] = [q for q in member.system.base if not self._is_shared(i, q)]
+        self.base = tuple(self._shared.values())
         self.candidates = self._all_candidates()
-        self.own = tuple(tuple(own) for own in self._own)  # of each member, the base quantities that it does not share
+        self.time = np.arange(len(members), dtype=float)
+        free = [sum(not np.isfinite(q.prior_sigma) for q in mine) for mine in own]
+        self.weights = np.array([np.sum(m.system.weights) for m in members]) - free
+        each = zip(members, own, strict=True)
+        self._reductions = [Reduction(m.system, mine, m.start) for m, mine in each]
 
     def all_groups(self) -> dict[str, dict[str, str]]:
         """Quantities of laws that differ from group to group: name -> group -> shared name."""
@@ -91,16 +127,17 @@ class Sharing:
         own = self.group(member, q)
         return sum(self.group(m, q) == own for m in self.members) == 1
 
-    def _base_quantity(self, i: int, q: Quantity) -> None:
+    def _is_shared(self, i: int, q: Quantity) -> bool:
+        """Is this base quantity of member i shared? Then it is entered as such."""
         member = self.members[i]
         if not q.belongs_to or (is_linear(q) and self._alone(member, q)):
-            self._own[i].append(q)
-            return
+            return False
         group = self.group(member, q)
         shared = self._share(i, q, group)
-        self.base.setdefault(shared.name, shared)
+        self._shared.setdefault(shared.name, shared)
         if not np.isfinite(q.prior_sigma):
             self._groups.setdefault(q.name, {})[group] = shared.name
+        return True
 
     def _share(self, i: int, local: Quantity, group: str) -> Quantity:
         # shared quantities are not projected out beforehand: rows of the joint system are not rows of data
@@ -154,71 +191,24 @@ class Sharing:
         for name, local in self.local[i].items():
             null = self._nulls[name]
             away = shared.get(name, null) - null
-            if away or name in self.base:
+            if away or name in self._shared:
                 values[local] = values.get(local, null) + away
         return values
 
     def start(self) -> dict[str, float]:
         """Initial values of the shared base quantities: the median over the recordings fitted alone."""
-        found: dict[str, list[float]] = {name: [] for name in self.base}
+        found: dict[str, list[float]] = {name: [] for name in self._shared}
         for member, parts in zip(self.members, self.local, strict=True):
             for name, local in parts.items():
                 if name in found:
                     found[name].append(member.start[local])
         return {name: float(np.median(alone)) for name, alone in found.items()}
 
-
-class Reduction:
-    """A system with some base quantities profiled out: they always have their best values."""
-
-    def __init__(self, system: System, own: Sequence[Quantity], start: Values) -> None:
-        """Own : quantities without bounds.   start : their initial values, and those of quantities that are held."""
-        self.system, self.own, self._start = system, tuple(own), start
-        self.moved = [q for q in own if not is_linear(q)]
-        self._first = self.own_values = {q.name: start.get(q.name, q.null) for q in self.moved}
-
-    def reduce(self, shared: Values, names: Sequence[str]) -> Reduced | None:
-        """The problem in the shared quantities `names`, at the values `shared`; None where there is no prediction."""
-        for start in (self.own_values, self._first):  # from the latest values, or else from the first ones
-            found = fit(self.system, self.own, {**self._start, **shared, **start})
-            if found.converged:
-                self.own_values = {name: found.values[name] for name in start}
-                return self._eliminated(shared, names)
-        return None
-
-    def _eliminated(self, shared: Values, names: Sequence[str]) -> Reduced | None:
-        values = {**self._start, **shared, **self.own_values}
-        common = projection(self.system, self.own, values)
-        values |= dict(zip(common.names, common.null.tolist(), strict=True))
-        residual, derivative = self.system.linearise(values, [*self.own_values, *names])
-        stacked = np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)])
-        if not np.isfinite(stacked).all():
-            return None
-        prior, matrix = prior_rows(self.moved, values)
-        known = np.column_stack([matrix, np.zeros((len(prior), len(names))), prior])
-        _, left = eliminate(np.concatenate([common.cleared(stacked), known]), len(self.moved))
-        return left[:, -1], left[:, :-1]
-
-
-class JointSystem(System):
-    """Recordings that share quantities. A row is the reduced least-squares problem of a recording."""
-
-    def __init__(self, sharing: Sharing, threads: int = 1) -> None:
-        """Threads : in which the recordings are worked on side by side."""
-        self.sharing, self._threads = sharing, threads
-        n, each = len(sharing.members), list(zip(sharing.members, sharing.own, strict=True))
-        self.time: Array = np.arange(n, dtype=float)
-        free = [sum(not np.isfinite(q.prior_sigma) for q in own) for own in sharing.own]
-        self.weights: Array = np.array([np.sum(m.system.weights) for m in sharing.members]) - free
-        self.base: tuple[Quantity, ...] = tuple(sharing.base.values())
-        self.candidates: tuple[Candidate, ...] = sharing.candidates
-        self._reductions = [Reduction(m.system, own, m.start) for m, own in each]
-
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Rows (n, w) of the reduced problems, padded with zeros, and their derivatives (n, w, k)."""
-        sharing, n = self.sharing, len(self.time)
-        local = [sharing.local_names(i, names) for i in range(n)]
-        each = [(r, sharing.local_values(i, values), local[i]) for i, r in enumerate(self._reductions)]
+        n = len(self.time)
+        local = [self.local_names(i, names) for i in range(n)]
+        each = [(r, self.local_values(i, values), local[i]) for i, r in enumerate(self._reductions)]
         found = side_by_side(Reduction.reduce, each, self._threads)
         reduced = {i: each for i, each in enumerate(found) if isinstance(each, tuple)}
         width = max([1, *(len(right) for right, _ in reduced.values())])
@@ -227,18 +217,18 @@ class JointSystem(System):
             residual[i] = 0.0
             residual[i, : len(right)] = right
             for column, name in enumerate(names):
-                if name in sharing.local[i]:
-                    derivative[i, : len(right), column] = matrix[:, local[i].index(sharing.local[i][name])]
+                if name in self.local[i]:
+                    derivative[i, : len(right), column] = matrix[:, local[i].index(self.local[i][name])]
         return residual, derivative
 
     def local_start(self, i: int, shared: Values) -> dict[str, float]:
         """Values of the quantities of recording i at these shared ones."""
-        start, own = self.sharing.members[i].start, self._reductions[i].own_values
-        return {**start, **own, **self.sharing.local_values(i, shared)}
+        start, own = self.members[i].start, self._reductions[i].own_values
+        return {**start, **own, **self.local_values(i, shared)}
 
     def local_quantities(self, i: int, names: Sequence[str]) -> tuple[Quantity, ...]:
         """Base quantities of recording i, and those of its candidates to which these shared ones contribute."""
-        system, local = self.sharing.members[i].system, self.sharing.local_names(i, names)
+        system, local = self.members[i].system, self.local_names(i, names)
         known = {q.name: q for c in system.candidates for q in c.quantities}
         return *system.base, *(known[n] for n in local if n in known)
 
@@ -249,7 +239,7 @@ class JointSystem(System):
         """
 
         def fitted(i: int) -> tuple[Fit, Fit]:
-            system = self.sharing.members[i].system
+            system = self.members[i].system
             found = fit(system, self.local_quantities(i, names), self.local_start(i, shared))
             growth = inflation(system, found)
             return found, replace(found, covariance=found.covariance * np.outer(growth, growth))

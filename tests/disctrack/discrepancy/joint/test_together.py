@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.joint.covariates import equivalent, hypotheses
 from disctrack.discrepancy.joint.fitting_in import Blocks, inconsistent
-from disctrack.discrepancy.joint.sharing import JointSystem, Sharing
+from disctrack.discrepancy.joint.sharing import JointSystem
 from disctrack.discrepancy.joint.side_by_side import side_by_side
 from disctrack.discrepancy.search import Settings, explain
 from disctrack.errors import AnalysisError
@@ -21,20 +21,20 @@ from tests.oracles.decaying_runs import fitted_at_once, member, runs
 
 
 def joint(items, threads=1):
-    return JointSystem(Sharing([member(item) for item in items]), threads)
+    return JointSystem([member(item) for item in items], threads)
 
 
 def answer(items):
     system = joint(items)
     n = len(items)
-    return system, explain(system, system.sharing.start(), Settings(noise=1.0), np.arange(n) % 3 != 2)
+    return system, explain(system, system.start(), Settings(noise=1.0), np.arange(n) % 3 != 2)
 
 
 def test_elimination_gives_what_all_quantities_at_once_give(rng):
     items = runs(rng, 6, drag=0.05)
     system = joint(items)
     drag = next(c for c in system.candidates if c.name == "drag")
-    found = fit(system, (*system.base, *drag.quantities), system.sharing.start())
+    found = fit(system, (*system.base, *drag.quantities), system.start())
     values, sigmas, cost = fitted_at_once(items, ["drag.c"])
     assert found.converged
     for name, sigma in zip(("friction.g", "drag.c"), sigmas, strict=True):
@@ -78,7 +78,7 @@ def test_of_two_with_a_disc_of_their_own_that_disagree_both_are_named(rng):
 
 def named(items, **more):
     system = joint(items)
-    found = fit(system, system.base, system.sharing.start())
+    found = fit(system, system.base, system.start())
     return inconsistent(system, found, 0.005, **more), system.candidates
 
 
@@ -101,7 +101,7 @@ def test_differences_in_an_effect_and_to_the_others_are_chi_squares_and_name_nob
     falls, judged, false = [], [], 0
     for _ in range(40):
         system = joint(runs(rng, 8))
-        found = fit(system, system.base, system.sharing.start())
+        found = fit(system, system.base, system.start())
         blocks = Blocks(system, found, system.candidates)
         for each in blocks.others(range(8)):
             falls.append(blocks.differences(*each))
@@ -121,11 +121,11 @@ def test_runs_that_declare_another_disc_have_a_rate_of_their_own(rng):
     changed |= {f"run_{i}": {"rate": 0.8 * 4**-0.5, "mass": 4.0} for i in range(12, 18)}
     system, found = answer(runs(rng, 18, **changed))
     assert found.verdict == "nothing missing"
-    groups = system.sharing.all_groups()["friction.g"]
+    groups = system.all_groups()["friction.g"]
     assert set(groups) == {"1 kg", "2 kg", "4 kg"}
     index = [found.after.names.index(n) for n in groups.values()]
     values = np.array([found.after.values[n] for n in groups.values()])
-    covariates = system.sharing.covariates_of("friction.g")
+    covariates = system.covariates_of("friction.g")
     assert covariates == {"mass": [1.0, 2.0, 4.0], "density": [1.0, 1.0, 1.0]}
     tested = hypotheses(values, found.after.covariance[np.ix_(index, index)], covariates)
     assert tested[0].text == "in proportion to a power of the mass"
@@ -144,7 +144,7 @@ def test_law_of_the_air_is_told_from_one_that_each_pressure_has_its_own(rng):
     wrong = {f"run_{i}": {"density": 0.1, "drag": 0.4 * 0.1**-0.5} for i in range(6)}
     system, found = answer(runs(rng, 12, drag=0.3, **wrong))
     assert found.found[0].candidate.name == "drag (each its own)"
-    values = np.array([found.after.values[n] for n in system.sharing.all_groups()["drag.c"].values()])
+    values = np.array([found.after.values[n] for n in system.all_groups()["drag.c"].values()])
     assert_allclose(values, [0.4 * 0.1**-0.5, 0.3], atol=0.1)
 
 
@@ -229,7 +229,7 @@ def test_the_number_of_threads_changes_no_bit(rng):
     found = []
     for threads in (1, 2):
         system = joint(items, threads)
-        found.append(explain(system, system.sharing.start(), Settings(noise=1.0)).after)
+        found.append(explain(system, system.start(), Settings(noise=1.0)).after)
     assert found[0].values == found[1].values
     assert (found[0].covariance == found[1].covariance).all()
 
