@@ -25,14 +25,14 @@ Outcome = tuple[Report, Mapping[str, Answer]]
 
 def effect(
     name: str, kind: str, title: str, unit: str, typical: float, *parts: str,
-    bounds: tuple[float, float] = (-np.inf, np.inf), source: str = "",
+    lower: float = -np.inf, upper: float = np.inf, source: str = "",
 ) -> Candidate:  # fmt: skip
     """Candidate of a system with the quantities `parts`, which are zero if the effect is absent.
 
     kind : "motion" or "measurement"
     typical : usual size
     """
-    one = Quantity(name, unit, 0.1 * typical, 0.0, *bounds, typical=typical)
+    one = Quantity(name, unit, 0.1 * typical, 0.0, lower, upper, typical=typical)
     return Candidate(name, name, kind, title, source, tuple(replace(one, name=f"{name}.{part}") for part in parts))
 
 

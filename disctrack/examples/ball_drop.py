@@ -26,10 +26,7 @@ from disctrack.report.blocks import Listing, Report, Section
 ACCELERATION_DEGREE = 4  # of the polynomial in time for the acceleration of all drops of a ball: any drag, to 1 mm
 SEEN = 1.2  # [s] of a second drop that are fitted; the rest is predicted, as in the published comparison
 FALL = Equations(
-    {"h": "v", "v": "-g"},
-    constants={"g": GRAVITY},
-    units={"h": "m", "v": "m/s"},
-    name=f"free fall, g = {GRAVITY} m/s^2",
+    {"h": "v", "v": "-g"}, constants={"g": GRAVITY}, units={"h": "m", "v": "m/s"}, name=f"free fall at {GRAVITY} m/s^2"
 )
 DRAG = {  # by name: force per mass, with one coefficient per ball; the constant one has the sign for a falling ball
     "constant_drag": ("k", Parameter(0.0, "m/s^2", lower=0.0, typical=1.0, per="ball")),

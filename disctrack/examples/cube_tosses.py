@@ -15,9 +15,9 @@ at 148 Hz. Lengths of the file are half widths of the cube; here they are metres
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import groupby, islice, pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,8 +42,7 @@ SHORTEST = 9  # samples of a flight
 RELEASE = 5.0  # [sigma] largest deviation of the first sample; beyond, the cube is still in the hand
 
 
-@dataclass(frozen=True)
-class Toss:
+class Toss(NamedTuple):
     """Poses of one toss."""
 
     number: int
@@ -56,8 +55,7 @@ class Toss:
         return np.asarray(self.position[:, 2] / HALF_WIDTH - np.abs(self.rotation[:, 2, :]).sum(axis=1), float)
 
 
-@dataclass(frozen=True)
-class Flight:
+class Flight(NamedTuple):
     """The part of a toss in free flight, with the smooth motion about which effects are linearised."""
 
     toss: Toss
@@ -105,10 +103,8 @@ def without_copies(tosses: Sequence[Toss]) -> tuple[Toss, ...]:
 
     Copies have the same heights to the last digit. They would spoil the test on held-out tosses.
     """
-    first: dict[bytes, Toss] = {}
-    for toss in tosses:
-        first.setdefault(np.round(toss.position[:8, 2] / HALF_WIDTH, 6).tobytes(), toss)
-    return tuple(first.values())
+    heights = [np.round(toss.position[:8, 2] / HALF_WIDTH, 6) for toss in tosses]
+    return tuple(tosses[i] for i in np.sort(np.unique(heights, axis=0, return_index=True)[1]))
 
 
 def flights(tosses: Sequence[Toss]) -> tuple[Flight, ...]:
@@ -157,20 +153,17 @@ CANDIDATES = (
     effect("gravity", _M, "another gravity", "m/s^2", 0.01, "change"),
     effect("frame_rate", _S, "frame rate wrong", "1", 1e-3, "change"),
     effect("length_scale", _S, "scale of the lengths wrong", "1", 0.02, "change"),
-    effect("tilt", _S, "vertical wrong, the same way in the axes of the file for all tosses", "rad", 0.01, "beta_x",
-           "beta_y"),
+    effect("tilt", _S, "vertical wrong, the same way in the axes of the file", "rad", 0.01, "beta_x", "beta_y"),
     effect("toss_tilt", _S, "vertical wrong, the same way in the axes of every toss", "rad", 0.01, *LEVEL),
-    effect("linear_drag", _M, "drag in proportion to the speed", "1/s", 0.03, "k",
-           bounds=(0.0, np.inf)),
-    effect("quadratic_drag", _M, "drag in proportion to the square of the speed", "1/m", 0.02, "k",
-           bounds=(0.0, np.inf)),
+    effect("linear_drag", _M, "drag in proportion to the speed", "1/s", 0.03, "k", lower=0.0),
+    effect("quadratic_drag", _M, "drag in proportion to the square of the speed", "1/m", 0.02, "k", lower=0.0),
     effect("side_force", _M, "force across the horizontal velocity, to its left", "1/s", 0.01, "c"),
     effect("magnus", _M, "lift of the spinning cube (Magnus)", "1", 0.004, "c"),
     effect("frame_rotation", _S, "world axes turn about the vertical", "rad/s", 1e-3, "rate"),
     effect("centre_of_mass", _M, "centre of mass not in the centre of the tags", "m", 2e-3, "c_1", "c_2", "c_3"),
     effect("principal_moments", _M, "moments of inertia not those of a uniform cube", "1", 0.05, "e_11", "e_22"),
     effect("products_of_inertia", _M, "products of inertia", "1", 0.05, "e_12", "e_13", "e_23"),
-    effect("rotational_drag", _M, "drag of the rotation", "1/s", 0.01, "k", bounds=(0.0, np.inf)),
+    effect("rotational_drag", _M, "drag of the rotation", "1/s", 0.01, "k", lower=0.0),
     effect("side_torque", _M, "torque that turns the angular velocity about the vertical", "1/s", 0.01, "c"),
     effect("twist", _S, "measured place and attitude turn about the vertical with height", "rad/m", 0.01, "a"),
     effect("perspective", _S, "scale of the lengths changes with place", "1/m", 5e-3, *AXES),
@@ -194,12 +187,12 @@ def _columns(seen: Array, changes: Mapping[str, ArrayLike]) -> Array:
 
 
 def flown(f: Flight) -> Array:
-    """(n, 6, k + 1 + 12): derivatives by QUANTITIES, measured minus base model [m], [rad], derivatives by own motion.
+    """(n, 6, k + 1 + 12): derivatives by QUANTITIES, measured minus base model, derivatives by own motion.
 
     The own motion of a flight: position, velocity, attitude and angular velocity, three numbers each.
     """
-    fallen = f.position + GRAVITY / 2 * f.time[:, None] ** 2 * UP
-    seen = np.concatenate([fallen, f.turn], axis=1)
+    seen = f.off
+    seen[:, :3] = f.position + GRAVITY / 2 * f.time[:, None] ** 2 * UP
     own = np.zeros((*seen.shape, 12))
     own[:, :3, :3], own[:, :3, 3:6] = np.eye(3), f.time[:, None, None] * np.eye(3)
     own[:, 3:, 6:9], own[:, 3:, 9:] = np.eye(3), integrated(np.swapaxes(f.turning, 1, 2))
@@ -220,11 +213,11 @@ def at_rest(flights: Sequence[Flight]) -> Array:
 
 
 def _flown(f: Flight) -> dict[str, Array]:
-    """Derivatives (n, 6) of position [m] and rotation in body axes [rad] of a flight by each quantity."""
+    """Derivatives (n, 6) of a flight by each quantity: of position, and of rotation in body axes at a face's middle."""
 
     def moved(position: Array | float, turn: Array | float = 0.0) -> Array:
         still = np.zeros(f.path.shape)
-        return np.concatenate([still + position, still + turn], axis=1)
+        return np.concatenate([still + position, still + HALF_WIDTH * turn], axis=1)
 
     def pushed(acceleration: Array) -> Array:
         return moved(integrated(integrated(np.broadcast_to(acceleration, f.path.shape))))
@@ -295,12 +288,8 @@ def _rested(f: Flight) -> tuple[Array, dict[str, Sequence[float]]]:
     return np.array([place[2] - HALF_WIDTH, *(level @ (rotation.mean(axis=0) @ outward))]), found
 
 
-HELD_OUT = 3  # every third toss
-FIRST_NOISE = {  # groups of channels with equal noise, and its initial guess
-    "horizontal": (slice(0, 2), SmoothNoise(2e-5, 5e-5, 0.03)),
-    "vertical": (slice(2, 3), SmoothNoise(2e-5, 3e-5, 0.03)),
-    "turn": (slice(3, 6), SmoothNoise(2e-4, 3e-4, 0.03)),
-}
+GROUPS = {"horizontal": slice(0, 2), "vertical": slice(2, 3), "turn": slice(3, 6)}  # channels with equal noise
+FIRST_NOISE = SmoothNoise(2e-5, 3e-5, 0.03)  # initial guess
 # The data are whitened already. Eight effects at most.
 SETTINGS = Settings(noise=1.0, unexplained_share=0.2, max_effects=8)
 
@@ -318,7 +307,7 @@ class CubeTosses(System):
     def __init__(self, flights: Sequence[Flight]) -> None:
         """Estimate the noise, and whiten the data with it."""
         self.flights, self._flown, self._at_rest = flights, [flown(f) for f in flights], at_rest(flights)
-        self.noise = {name: noise for name, (_, noise) in FIRST_NOISE.items()}
+        self.noise = dict.fromkeys(GROUPS, FIRST_NOISE)
         for _ in range(2):
             self._whiten()
             self.noise = self._measured_noise()
@@ -330,7 +319,7 @@ class CubeTosses(System):
         return left[:, None], self.effects[:, None, [COLUMN[n] for n in names]]
 
     def residuals(self, values: Values) -> list[Array]:
-        """Residuals (n, 6) [m], [rad] of every flight, with its own motion by least squares."""
+        """Residuals (n, 6) [m] of every flight, with its own motion by least squares."""
         found = []
         for rows in self._flown:
             effects, seen, own = np.split(rows.reshape(-1, rows.shape[-1]), [len(COLUMN), len(COLUMN) + 1], axis=1)
@@ -342,7 +331,7 @@ class CubeTosses(System):
         parts, training = [], []
         for f, rows, rest in zip(self.flights, self._flown, self._at_rest, strict=True):
             white = rows.copy()
-            for name, (channels, _) in FIRST_NOISE.items():
+            for name, channels in GROUPS.items():
                 white[:, channels] = np.tensordot(self.noise[name].whitening(f.time), rows[:, channels], axes=1)
             effects, own = np.split(white.reshape(-1, rows.shape[-1]), [len(COLUMN) + 1], axis=1)
             beside_own = np.linalg.qr(own, mode="complete")[0][:, own.shape[1] :].T @ effects
@@ -361,8 +350,10 @@ class CubeTosses(System):
         # some compensate each other: the solution that is smallest in units of the usual sizes
         size = np.array([q.typical for q in QUANTITIES])
         amounts = size * np.linalg.lstsq(self.effects * size, self.seen, rcond=1e-9)[0]
-        left = self.residuals(dict(zip(COLUMN, amounts.tolist(), strict=True)))
-        return {name: _noise(left, channels, start) for name, (channels, start) in FIRST_NOISE.items()}
+        left = sorted(self.residuals(dict(zip(COLUMN, amounts.tolist(), strict=True))), key=len)
+        # flights of equal length share their instants: (n, flights, 6)
+        alike = [np.stack([*some], axis=1) for _, some in groupby(left, key=len)]
+        return {name: _noise([some[..., channels] for some in alike]) for name, channels in GROUPS.items()}
 
 
 def _amounts(values: Values) -> Array:
@@ -370,17 +361,15 @@ def _amounts(values: Values) -> Array:
 
 
 def _kept_back(flight: Flight) -> bool:
-    return flight.toss.number % HELD_OUT == HELD_OUT - 1
+    """Every third toss."""
+    return flight.toss.number % 3 == 2
 
 
-def _noise(left: Sequence[Array], channels: slice, start: SmoothNoise) -> SmoothNoise:
-    """Noise of channels of all flights; flights of equal length share their instants, and are columns of one array."""
-    stretches = []
-    for n, alike in groupby(sorted(left, key=len), key=len):
-        time = np.arange(n) / FRAME_RATE
-        values = np.concatenate([flight[:, channels] for flight in alike], axis=1)
-        stretches.append(SampleStretch(time, values, time[:, None] ** np.arange(2)))
-    return estimate(stretches, start)
+def _noise(left: Sequence[Array]) -> SmoothNoise:
+    """Noise of residuals, each (n, flights, channels)."""
+    times = [np.arange(len(some)) / FRAME_RATE for some in left]
+    samples = [(time, some.reshape(len(time), -1)) for time, some in zip(times, left, strict=True)]
+    return estimate([SampleStretch(*one, one[0][:, None] ** np.arange(2)) for one in samples], FIRST_NOISE)
 
 
 def diagnosed(system: CubeTosses) -> Diagnosis:
@@ -388,19 +377,18 @@ def diagnosed(system: CubeTosses) -> Diagnosis:
     return explain(system, {}, SETTINGS, system.training)
 
 
-def rms_of(system: CubeTosses, values: Values) -> dict[str, float]:
-    """Rms residuals of the held-out flights, per group of channels [m], [rad]."""
-    residuals = zip(system.flights, system.residuals(values), strict=True)
-    left = [x for flight, x in residuals if _kept_back(flight)]
-    freedom = sum(len(x) - 2 for x in left)
-    square = np.sum(np.concatenate(left) ** 2, axis=0) / freedom
-    return {name: float(np.sqrt(np.mean(square[channels]))) for name, (channels, _) in FIRST_NOISE.items()}
+def errors(system: CubeTosses, d: Diagnosis) -> list[dict[str, float]]:
+    """Rms residuals [m] of the held-out flights per group of channels: of the base model, and with the effects found.
 
-
-def errors(system: CubeTosses, d: Diagnosis) -> tuple[dict[str, float], dict[str, float]]:
-    """`rms_of` the base model, and of the effects found with values fitted to the other flights."""
-    held = d.held_out_after
-    return rms_of(system, {}), rms_of(system, held.train.values if held else {})
+    Their values are fitted to the other flights.
+    """
+    found = []
+    for values in ({}, d.held_out_after.train.values if d.held_out_after else {}):
+        residuals = zip(system.flights, system.residuals(values), strict=True)
+        left = [x for flight, x in residuals if _kept_back(flight)]
+        square = np.sum(np.concatenate(left) ** 2, axis=0) / sum(len(x) - 2 for x in left)
+        found.append({name: float(np.sqrt(np.mean(square[channels]))) for name, channels in GROUPS.items()})
+    return found
 
 
 def example(folder: Path) -> Outcome:
@@ -413,15 +401,11 @@ def example(folder: Path) -> Outcome:
     effects = "; ".join(effect_text(f, d) for f in d.found)
     said = f"Missing: {effects}." if effects else "No effect is claimed to be missing."
     said += f" Something else is missing: {d.reason}." if d.verdict == "unexplained" else ""
-    rows = []
-    for group, noise in system.noise.items():
-        size, unit = (float(np.degrees(1e3)), "mdeg") if group == "turn" else (1e6, "um")
-        numbers = (before[group], after[group], noise.white)
-        rows.append((f"rms {group} ({unit})", *(rounded(size * x) for x in numbers)))
-    copies, left_out = len(published) - len(tosses), len(tosses) - len(system.flights)
+    numbers = {group: (before[group], after[group], noise.white) for group, noise in system.noise.items()}
+    rows = [(f"rms {group} (um)", *(rounded(1e6 * x) for x in some)) for group, some in numbers.items()]
     caption = (
-        f"{len(system.flights)} flights, each with its cube at rest; without {left_out} tosses that are too short or "
-        f"not smooth, and {copies} copies of others, rotated about the vertical."
+        f"{len(system.flights)} flights, each with its cube at rest, of {len(tosses)} tosses; {len(published)} with "
+        "copies, rotated about the vertical. Others are too short or not smooth. Turns: shifts of a face's middle."
     )
     blocks = [Section("Every third toss, held out", [Listing(("", "before", "after", "white noise"), rows, caption)])]
     model = f"g = {GRAVITY} m/s^2, uniform cube, {FRAME_RATE:g} Hz, half width {HALF_WIDTH} m"

@@ -82,7 +82,7 @@ def test_a_thin_disc_at_small_nutation_has_the_exponents_of_theory(law, exponent
     """n_theta = 1 / (1 - a) for a power that goes with theta^a, n_psidot = -n_theta / 2; slow precession to 1 %."""
     disc = replace(MA_2014, half_thickness=1e-6)
     setup = Series("", 0.0, longest=0.4, start=np.radians(0.1), disc=disc)
-    stage = LastStage(setup, law)
+    stage = LastStage(setup, law.items())
     n_energy, n_theta, n_psidot, _ = stage.outcomes()
     assert stage.duration > 0.6
     assert_allclose([n_theta, n_energy, -2 * n_psidot], exponent, rtol=0.01)
@@ -91,7 +91,7 @@ def test_a_thin_disc_at_small_nutation_has_the_exponents_of_theory(law, exponent
 def test_an_early_t_f_lowers_the_exponents_as_for_an_exact_power_law():
     """The simulated motion is a power law to 1 %, so that the line through ln (t + b)^(2/3) has the same slope."""
     disc = replace(MA_2014, half_thickness=1e-6)
-    stage = LastStage(Series("", 0.0, longest=0.4, start=np.radians(2.0), disc=disc), {"km.k_m": 4e-9})
+    stage = LastStage(Series("", 0.0, longest=0.4, start=np.radians(2.0), disc=disc), [("km.k_m", 4e-9)])
     left = np.linspace(0.4, np.exp(-3), 351)
     for bias in (-0.03, -0.01, 0.005):
         expected = np.polyfit(np.log(left), 2 / 3 * np.log(left - bias), 1)[0] - 2 / 3
