@@ -477,16 +477,16 @@ class _Search:
             if self.length(e) > self.length(self.base_model):
                 break
             parent = next((other for other in ranked if other.names < e.names), self.base_model)
-            held = self._held_out_gain(parent, e)
+            held = self._held_out_gain(parent.fit, e.fit)
             enough = OBVIOUS * self._price([c for c in e.candidates if c.name not in parent.names])
             obvious = held > -CLASS_GAIN and (parent.fit.cost - e.fit.cost) / self.noise > enough
             if held > 0 or obvious:
                 return e
         return self.base_model
 
-    def _held_out_gain(self, before: Explanation, after: Explanation) -> float:
+    def _held_out_gain(self, before: Fit, after: Fit) -> float:
         """Gain of twice the held-out log predictive density, in units of the noise."""
-        return self._held_out(after.fit).gain_over(self._held_out(before.fit), self.noise)
+        return self._held_out(after).gain_over(self._held_out(before), self.noise)
 
     def _explains_most(self, after: Explanation) -> bool:
         """Does an explanation remove nearly all of the excess chi-square, of the fit and of the held-out data?
@@ -617,8 +617,7 @@ class _Search:
 
     def _found(self, e: Explanation, candidate: Candidate, alternatives: list[Alternative]) -> Found:
         without = self._fit(*_without(e, candidate), patient=True)
-        held_gain = self._held_out(e.fit).gain_over(self._held_out(without), self.noise)
-        gain = (without.cost - e.fit.cost) / self.noise
+        held_gain, gain = self._held_out_gain(without, e.fit), (without.cost - e.fit.cost) / self.noise
         return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(alternatives))
 
     def _all_outcomes(self, scores: Sequence[Score], found: tuple[Found, ...]) -> tuple[Tried, ...]:
@@ -632,7 +631,7 @@ class _Search:
         gain, held, stuck = first_order if refit_gain is None else refit_gain, None, False
         if trial is not None:
             stuck = not trial.fit.converged
-            held = self._held_out_gain(self.base_model, trial) if trial.fit in self.predictions else None
+            held = self._held_out_gain(self.base_model.fit, trial.fit) if trial.fit in self.predictions else None
         same = {r.candidate.name: f.candidate.name for f in found for r in f.cannot_be_told_from}
         if c.name in {f.candidate.name for f in found}:
             reason = "chosen"
