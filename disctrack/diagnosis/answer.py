@@ -52,7 +52,7 @@ class DiscDiagnosis(Brief):
     learned: Learned | None = None
     notes: tuple[str, ...] = ()  # on frames that were left out, and on doubts
     holds: Mapping[str, ValidRange | None] = field(default_factory=dict)  # of a model that fails elsewhere
-    tests: ResidualTests | None = None  # None if too few rows are complete
+    tests: ResidualTests = field(default_factory=ResidualTests)
     plan: Plan | None = None  # recordings that would answer the open questions, if requested
 
     def facts(self) -> dict[str, str]:
@@ -99,8 +99,8 @@ class DiscDiagnosis(Brief):
         after, before = self.after, self.diagnosis.before.reduced_chi_square
         if after is None:
             return ""
-        white = self.tests is None or self.tests.white
-        noise = " noise of" if white and self.diagnosis.verdict != "unexplained" and self.learned is None else ""
+        is_noise = self.tests.white and self.diagnosis.verdict != "unexplained" and self.learned is None
+        noise = " noise of" if is_noise else ""
         chi, fell = after.reduced_chi_square, ""
         if before > chi + 1e-9:
             fell = f"; chi-square per degree of freedom fell from {rounded(before, 4)} to {rounded(chi, 4)}"
@@ -115,7 +115,7 @@ class DiscDiagnosis(Brief):
         if self.after is None:
             return []
         found = [_errors_of_dots(self.system.systematic)] if self.system.systematic.present else []
-        return found if self.tests is None or self.tests.white else [*found, _not_noise(self.tests)]
+        return found if self.tests.white else [*found, _not_noise(self.tests)]
 
 
 def unnamed(effects: str) -> str:

@@ -110,11 +110,13 @@ class ResidualTests:
     number of tests (Bonferroni).
     """
 
-    pose_chi_square: float  # per component of the poses, over the noise
-    other_chi_square: float  # per component that no pose absorbs, over the noise
-    pose_p_value: float  # of the autocorrelation (Ljung-Box) and of the lines in the spectrum of the poses' components
-    other_p_value: float  # of the autocorrelation of the others
-    n_tests: int
+    pose_chi_square: float = 1.0  # per component of the poses, over the noise
+    other_chi_square: float = 1.0  # per component that no pose absorbs, over the noise
+    pose_p_value: float = (
+        1.0  # of the autocorrelation (Ljung-Box) and of the lines in the spectrum of the poses' components
+    )
+    other_p_value: float = 1.0  # of the autocorrelation of the others
+    n_tests: int = 0
 
     @property
     def white(self) -> bool:
@@ -147,13 +149,13 @@ class ResidualTests:
         return 0.05 < excess < MUCH and self.alike
 
 
-def residual_tests(system: DiscSystem, fit_: Fit, noise: float) -> ResidualTests | None:
-    """Tests of the residuals of a fit; None if too few rows are complete.   noise : variance over that stated"""
+def residual_tests(system: DiscSystem, fit_: Fit, noise: float) -> ResidualTests:
+    """Tests of the residuals of a fit; the defaults if few rows are complete.   noise : variance over that stated"""
     most = np.max(system.weights)
     full = system.weights >= most
     n = int(full.sum())
     if n < MIN_FRAMES or most < 8:
-        return None
+        return ResidualTests()
     pose, other = (part[full] for part in system.parts_of_residual(fit_.values))
     tested = whiteness(pose, system.rate, {})
     return ResidualTests(

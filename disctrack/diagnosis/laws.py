@@ -87,8 +87,7 @@ def learn(
 def _leaves_noise(known: DiscSystem, fitted: Fit, noise: float) -> bool:
     if fitted.reduced_chi_square > noise * (1.0 + 4.0 * float(np.sqrt(2.0 / np.sum(known.weights)))):
         return False
-    left = residual_tests(known, fitted, noise)
-    return left is None or not left.of_the_motion
+    return not residual_tests(known, fitted, noise).of_the_motion
 
 
 def base_alone(base: Fit, along: Fit) -> Fit:
@@ -210,7 +209,6 @@ class WithLaw(Explanation):
     """An explanation by a law and known effects, fitted together."""
 
     law: LearnedLaw
-    system: DiscSystem  # its model contains the law
     kept: tuple[Found, ...]
 
     @property
@@ -219,14 +217,12 @@ class WithLaw(Explanation):
         return (*super().effects, self.law.title)
 
 
-def explained_by_law(
-    system: DiscSystem, diagnosis: Diagnosis, left: ResidualTests | None
-) -> tuple[WithLaw | None, Diagnosis]:
+def explained_by_law(system: DiscSystem, diagnosis: Diagnosis, left: ResidualTests) -> tuple[WithLaw | None, Diagnosis]:
     """The explanation with a law if it is the shortest; and the diagnosis with all explanations with laws in its list.
 
     Among indistinguishable ones, that with the fewest known effects.
     """
-    noise, subsets = diagnosis.noise, _subsets(system, diagnosis, left is not None and left.doubtful)
+    noise, subsets = diagnosis.noise, _subsets(system, diagnosis, left.doubtful)
     found = [_law_with(system, diagnosis, kept) for kept in subsets if system.budget.open()]
     answers = [a for a in found if a is not None and a.fit.converged]
     if not answers:
@@ -322,7 +318,7 @@ def _law_with(system: DiscSystem, diagnosis: Diagnosis, kept: tuple[Found, ...])
             again[again.index(found)] = replace(found, gain=float(gain), cannot_be_told_from=())
     known_effects = tuple(f.candidate for f in again)
     its = length(system, diagnosis.settings, noise, fitted, known_effects) + law.looked * len(law.families)
-    return WithLaw(candidates=known_effects, fit=fitted, length=its, law=law, system=known, kept=tuple(again))
+    return WithLaw(candidates=known_effects, fit=fitted, length=its, law=law, kept=tuple(again))
 
 
 def _others(best: WithLaw, answers: Sequence[WithLaw], diagnosis: Diagnosis) -> tuple[tuple[LearnedLaw, float], ...]:

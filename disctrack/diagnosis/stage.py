@@ -107,12 +107,12 @@ def with_plan(result: DiscDiagnosis) -> DiscDiagnosis:
     return replace(result, plan=plan(result.system, diagnosis.after, questions, diagnosis.noise))
 
 
-def _verdict_by_residuals(diagnosis: Diagnosis, tests: ResidualTests | None) -> Diagnosis:
+def _verdict_by_residuals(diagnosis: Diagnosis, tests: ResidualTests) -> Diagnosis:
     """The verdict, corrected by whether the residuals are those of the motion or of the measurement.
 
     Residuals may be autocorrelated although chi-square is small, and chi-square may be large by errors of the dots.
     """
-    if tests is None or not diagnosis.after.converged:
+    if not diagnosis.after.converged:
         return diagnosis
     verdict, but = diagnosis.verdict, ""
     if verdict != "unexplained" and tests.of_the_motion:
@@ -143,8 +143,8 @@ def _with_law(
     held_gain = held.gain_over(diagnosis.held_out_before, noise)
     work = energy_balance(known, fitted.values)[f"by {law.candidate.name}"]
     power = -work / float(known.time[-1] - known.time[0])
-    tests = residual_tests(known, fitted, noise)
-    as_found = known, with_autocorrelation(judged, fitted), law, noise, tests is not None and not tests.white
+    white = residual_tests(known, fitted, noise).white
+    as_found = known, with_autocorrelation(judged, fitted), law, noise, not white
     after, of_another, course, misfit = with_form(*as_found, _of_motion(kept))
     established, not_claimed = _for_any_form(kept, of_another, law.looked)
     if _of_motion(established):  # an effect that is significant with any form of the law is no part of its misfit

@@ -80,7 +80,7 @@ class JointSystem(System):
         # of each member: shared name -> its quantity, whose difference from null is the sum of theirs
         self.local: list[dict[str, str]] = [{} for _ in members]
         for i, member in enumerate(members):
-            own[i] = [q for q in member.system.base if not self._is_shared(i, q)]
+            own[i] = [q for q in member.system.base if not self._share_base(i, q)]
         self.base = tuple(self._shared.values())
         self.candidates = self._all_candidates()
         self.time = np.arange(len(members), dtype=float)
@@ -127,8 +127,8 @@ class JointSystem(System):
         own = self.group(member, q)
         return sum(self.group(m, q) == own for m in self.members) == 1
 
-    def _is_shared(self, i: int, q: Quantity) -> bool:
-        """Is this base quantity of member i shared? Then it is entered as such."""
+    def _share_base(self, i: int, q: Quantity) -> bool:
+        """Enter a base quantity of member i among the shared ones; False if it is the member's own."""
         member = self.members[i]
         if not q.belongs_to or (is_linear(q) and self._alone(member, q)):
             return False
