@@ -150,15 +150,15 @@ def _summed_up(
     records: dict[str, Row],
     options: BatchOptions,
     interrupted: bool,
-    threads: int,
+    processes: int,
 ) -> BatchOutcome:
-    """Diagnosis of all together and summary; threads : for that diagnosis, 0 to omit it."""
+    """Diagnosis of all together and summary; processes : for that diagnosis, 0 to omit it."""
     problems = [f"not searched: {problem}" for problem in found.problems]
     said = ""
-    if options.together and threads and not interrupted:
+    if options.together and processes and not interrupted:
         measured = rows_of(found, records)
         try:
-            said = diagnose_all(found.common, measured, threads)
+            said = diagnose_all(found.common, measured, processes)
         except AnalysisError as error:
             problems.append(f"together: {error}")
         except KeyboardInterrupt:  # the summary is written nevertheless
@@ -175,7 +175,7 @@ def _summed_up(
     return BatchOutcome(own, files, tuple(problems), interrupted, said)
 
 
-def diagnose_all(folder: Path, rows: Sequence[Row], threads: int) -> str:
+def diagnose_all(folder: Path, rows: Sequence[Row], processes: int) -> str:
     """Verdict of one diagnosis of all measured trajectories, reused if it exists in its folder below the summary.
 
     Raises AnalysisError if it is not possible.
@@ -187,7 +187,7 @@ def diagnose_all(folder: Path, rows: Sequence[Row], threads: int) -> str:
         raise AnalysisError(f"{len(trajectories)} of the recordings measured; it takes two or more")
     try:
         whole = (folder / TOGETHER).parent
-        return run_together(trajectories, whole, overwrite=True, reuse=True, threads=threads).verdict
+        return run_together(trajectories, whole, overwrite=True, reuse=True, processes=processes).verdict
     except Exception as error:  # must not prevent the summary of the single results
         raise AnalysisError(f"the recordings could not be diagnosed: {reason_of(error)}") from error
 

@@ -67,7 +67,7 @@ def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
             overwrite=arguments.overwrite,
             reuse=not arguments.overwrite,
             settle=arguments.plan,
-            threads=arguments.jobs or default_threads(),
+            processes=arguments.jobs or default_threads(),
             progress=step,
         )
     code = outputs.finish(report, arguments, report.files[0].parent)

@@ -174,7 +174,7 @@ def add_diagnose(parser: argparse.ArgumentParser) -> None:
     what = "folder for the results (default: NAME_diagnosis beside it; of several: together_diagnosis)"
     _file(parser, "-o --output", what)
     _flag(parser, "--plan", "also compute which further recordings would settle what is left open")
-    _value(parser, "-j --jobs N", _positive, "of several recordings, how many at a time (default: cores)")
+    _value(parser, "-j --jobs N", _positive, "processes for several files (default: cores)")
     _flag(parser, "--anyway", "even where a number is declared wrong")
     _flag(parser, "--overwrite", "replace an earlier diagnosis")
 

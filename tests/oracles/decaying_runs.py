@@ -7,7 +7,7 @@ c t exp(-g t), the air's, that goes with the root of its density; a hum, the rig
 import numpy as np
 
 from disctrack.discrepancy.fit import fit
-from disctrack.discrepancy.joint.sharing import Member
+from disctrack.discrepancy.joint.sharing import Member, Reduction
 from disctrack.discrepancy.system import Candidate, Quantity
 from tests.oracles.linear_system import Predicted
 
@@ -39,12 +39,22 @@ class Decay(Predicted):
         return x + get("hum.c") * np.cos(9 * t) + get("hum.s") * np.sin(9 * t)
 
 
-def member(item):
-    """A run fitted alone, as the recordings of the disc are."""
-    name, observed, labels, covariates, density = item
-    system = Decay(observed, density)
-    base = fit(system, system.base, {"state.a": 1.0, "state.b": 0.0, "friction.g": 1.0})
-    return Member(name, system, base.values, labels, covariates)
+class DecayMember:
+    """As the recordings of the disc are to a crew."""
+
+    def __init__(self, item):
+        name, observed, labels, covariates, density = item
+        self.system = Decay(observed, density)
+        self.base = fit(self.system, self.system.base, {"state.a": 1.0, "state.b": 0.0, "friction.g": 1.0})
+        candidates = self.system.candidates
+        self.member = Member(name, self.system.base, candidates, self.base.values, len(TIME), labels, covariates)
+
+    def share(self, own):
+        mine = [q for q in self.system.base if q.name in own]
+        self.reduction = Reduction(self.system, mine, self.base.values)
+
+    def reduce(self, values, names):
+        return self.reduction.reduce(values, names)
 
 
 def runs(rng, n, drag=0.0, rate=0.8, **changed):

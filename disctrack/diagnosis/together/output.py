@@ -199,13 +199,13 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
 
     from disctrack.report.figures import Drawn, panels
 
-    system, after = answer.system, answer.diagnosis.after
+    sharing, after = answer.system.sharing, answer.diagnosis.after
     used = [r for r in answer.recordings if not r.reason]
     drawn = []
     for number, q in enumerate(_free(answer.diagnosis), start=1):
         points = []
         for i, a in enumerate(r.alone for r in used):
-            for local in system.local_names(i, [q.name]):
+            for local in sharing.local_names(i, [q.name]):
                 if a is not None and a.converged and a.sigma(local) > 0:
                     points.append((i, a.values[local], a.sigma(local)))
         if len(points) < 2:

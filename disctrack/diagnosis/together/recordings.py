@@ -6,29 +6,31 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.kit.arrays import Array
-from calibration.kit.threads import one_blas_thread
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.large_faults import large_faults
 from disctrack.diagnosis.model_file import PAPER, declared_model
-from disctrack.diagnosis.plan import Plan, open_questions, plan
+from disctrack.diagnosis.plan import Information, Plan, Question, open_questions, plan
 from disctrack.diagnosis.recorded import Recorded, wrong_declarations
 from disctrack.diagnosis.systematic import MAX_FRAMES, Systematic, find_systematic, noise_over_stated, with_noise
-from disctrack.discrepancy.fit import fit, no_fit
-from disctrack.discrepancy.joint.sharing import Member, Reduction
-from disctrack.discrepancy.joint.side_by_side import side_by_side
+from disctrack.discrepancy.fit import Fit, fit, no_fit
+from disctrack.discrepancy.joint.crew import Crew
+from disctrack.discrepancy.joint.sharing import Member, Reduced, Reduction
 from disctrack.discrepancy.joint.together import TogetherDiagnosis, answer_together
+from disctrack.discrepancy.noise import inflation
+from disctrack.discrepancy.system import Values
 from disctrack.errors import AnalysisError
 from disctrack.files.json_text import json_text
 from disctrack.findings import Kind
 from disctrack.track.side_by_side import evenly
 from disctrack.trajectory import Trajectory
 
+Item = tuple[Recorded, Mapping[str, str], str]  # recording, its labels, the model
 
-@one_blas_thread
+
 def diagnose_together(
     recordings: Sequence[Recorded],
     model: str = PAPER,
-    threads: int = 1,
+    processes: int = 1,
     progress: Callable[[str], None] = lambda text: None,
     settle: bool = False,
     unread: Mapping[str, str] | None = None,
@@ -37,48 +39,42 @@ def diagnose_together(
 
     model : as for `diagnose`
     unread : further recordings that are reported as left out, with the reasons
-    threads : that share the recordings; the answer does not depend on their number
+    processes : that share the recordings; the answer does not depend on their number
     settle : also compute which further recording would answer the open questions
     Raises AnalysisError if fewer than two recordings can be used.
     """
-    described = [(r.name, labels) for r, labels in zip(recordings, labels_of(recordings), strict=True)]
-    progress(f"{len(recordings)} recordings, each alone")
-    found = side_by_side(_prepared, [(r.trajectory, model) for r in recordings], threads)
-    good = [i for i, one in enumerate(found) if isinstance(one, DiscSystem)]
-    common = in_common([(described[i][1], found[i]) for i in good])
-    each = [(*described[i], found[i], systematic) for i, systematic in zip(good, common, strict=True)]
-    for i, member in zip(good, side_by_side(_alone, each, threads), strict=True):
-        found[i] = member
-    for name, reason in (unread or {}).items():
-        described.append((name, {}))
-        found.append(AnalysisError(reason))
-    answer = answer_together(described, found, threads, progress)
-    return replace(answer, plan=_plan(answer)) if settle else answer
+    labels = labels_of(recordings)
+    items = [(recorded, label, model) for recorded, label in zip(recordings, labels, strict=True)]
+    described = [(recorded.name, label) for recorded, label, _ in items]
+    progress(f"{len(items)} recordings, each alone")
+    with Crew(DiscMember, items, processes) as crew:
+        answer = answer_together(crew, described, in_common, progress, unread or {})
+        return replace(answer, plan=_plan(answer, crew)) if settle else answer
 
 
-def _plan(answer: TogetherDiagnosis) -> Plan | None:
+def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
     """Further recordings, with disc, surface and cameras of the longest one."""
-    system, diagnosis, after = answer.system, answer.diagnosis, answer.diagnosis.after
+    system, diagnosis = answer.system, answer.diagnosis
+    sharing, after = system.sharing, diagnosis.after
     longest = int(np.argmax(system.weights))
-    local = {c.name for c in system.members[longest].system.candidates}
+    local = {c.name for c in sharing.members[longest].candidates}
     questions = open_questions(diagnosis, [b for b in answer.bounds if b.candidate.name in local])
     questions = tuple(question for question in questions if {c.name for c in question} <= local)
     if not questions:
         return None
     tested = [q for question in questions for c in question for q in c.quantities]
     everything = {q.name: q for q in (*tested, *after.quantities)}
-    parts = reversed(system.local[longest].items())  # of a sum of shared quantities the first one is kept
+    parts = reversed(sharing.local[longest].items())  # of a sum of shared quantities the first one is kept
     names = {there: shared for shared, there in parts if shared in everything}
     others = [q for n, q in everything.items() if n not in set(names.values())]
     values = {n: q.null for n, q in everything.items()} | after.values
     known = Reduction(system, others, values).reduce(values, tuple(names.values()))
     if known is None:
         return None
-    extra, start = [n for f in diagnosis.found for n in f.candidate.names], system.local_start(longest, after.values)
-    fitted = no_fit(system.local_quantities(longest, extra), start)
-    of_disc = system.members[longest].system
-    # an error where no motion can be planned
-    (found,) = side_by_side(plan, [(of_disc, fitted, questions, 1.0, (tuple(names), known[1]))])
+    information = tuple(names), known[1]
+    extra = sharing.local_names(longest, [n for f in diagnosis.found for n in f.candidate.names])
+    arguments = sharing.local_values(longest, after.values), extra, questions, information
+    (found,) = crew.call("planned", [arguments], [longest])
     return found if isinstance(found, Plan) else None
 
 
@@ -100,63 +96,106 @@ def _density(trajectory: Trajectory) -> float:
     return float(f"{trajectory.air_density:.3g}")
 
 
-def _prepared(as_tracked: Trajectory, model: str) -> DiscSystem:
-    """The system of a recording, with its own systematic errors.
+class DiscMember:
+    """One recording of the disc: prepared, fitted alone, then reduced to its information on the shared quantities."""
 
-    Raises AnalysisError if it cannot be fitted with the others, or is declared wrongly.
-    """
-    # a wrong weight would not show in laws that are proportional to the load
-    wrong = [f for f in as_tracked.findings if f.kind == Kind.DENSITY] or wrong_declarations(as_tracked.findings)
-    if wrong:
-        raise AnalysisError("; ".join(f.sentence for f in wrong))
-    trajectory = with_noise(as_tracked, noise_over_stated(as_tracked))  # which sets the weight of the recording
-    declared, faults = declared_model(trajectory, model)
-    system = DiscSystem(trajectory, declared, known=faults)
-    systematic = find_systematic(system)
-    if (large := large_faults(as_tracked, system, systematic)) is not None:
-        names = " or ".join(name for guess in large[1] for name in guess)
-        raise AnalysisError(f"its dots show a large fault of the measurement ({names}): diagnose it alone")
-    return system.again(systematic=systematic)
+    def __init__(self, item: Item) -> None:
+        """Raises AnalysisError if it cannot be fitted with the others, or is declared wrongly."""
+        recorded, self.labels, model = item
+        self.name, as_tracked = recorded.name, recorded.trajectory
+        # a wrong weight would not show in laws that are proportional to the load
+        wrong = [f for f in as_tracked.findings if f.kind == Kind.DENSITY] or wrong_declarations(as_tracked.findings)
+        if wrong:
+            raise AnalysisError("; ".join(f.sentence for f in wrong))
+        trajectory = with_noise(as_tracked, noise_over_stated(as_tracked))  # which sets the weight of the recording
+        declared, faults = declared_model(trajectory, model)
+        self.system = DiscSystem(trajectory, declared, known=faults)
+        self.systematic = find_systematic(self.system)
+        if (large := large_faults(as_tracked, self.system, self.systematic)) is not None:
+            names = " or ".join(name for guess in large[1] for name in guess)
+            raise AnalysisError(f"its dots show a large fault of the measurement ({names}): diagnose it alone")
 
+    def summary(self) -> tuple[Mapping[str, str], Systematic, list[Array]]:
+        """Labels, systematic errors, and positions of the dots in each camera [px], for `in_common`."""
+        rows = evenly(np.arange(len(self.system.time)), MAX_FRAMES)
+        used, places = self.system.used[rows], self.system.observed[rows]
+        return self.labels, self.systematic, [places[:, c][used[:, c]] for c in range(2)]
 
-def _alone(name: str, labels: Mapping[str, str], system: DiscSystem, systematic: Systematic) -> Member:
-    """The recording, fitted alone with systematic errors that it shares with others. Raises AnalysisError."""
-    system = system.again(systematic=systematic)
-    base = fit(system, system.base, system.start())
-    if not base.converged:
-        raise AnalysisError(
-            f"the rolling model cannot be fitted to it alone (chi-square {base.reduced_chi_square:.3g})"
+    def with_common(self, systematic: Systematic) -> Member:
+        """The member, fitted alone with systematic errors that it shares with others. Raises AnalysisError."""
+        self.system = system = self.system.again(systematic=systematic)
+        self.base = fit(system, system.base, system.start())
+        if not self.base.converged:
+            raise AnalysisError(
+                f"the rolling model cannot be fitted to it alone (chi-square {self.base.reduced_chi_square:.3g})"
+            )
+        disc, air = system.disc, {"density of the air": _density(system.trajectory)}
+        return Member(
+            self.name,
+            system.base,
+            system.candidates,
+            self.base.values,
+            int(np.sum(system.weights)),
+            self.labels,
+            covariates=air | {"mass": disc.mass, "radius": disc.radius, "thickness": 2 * disc.half_thickness},
         )
-    disc, air = system.disc, {"density of the air": _density(system.trajectory)}
-    sizes = {"mass": disc.mass, "radius": disc.radius, "thickness": 2 * disc.half_thickness}
-    return Member(name, system, base.values, labels, air | sizes)
+
+    def share(self, own: Sequence[str]) -> None:
+        """Declare which quantities are its own; all others of the base are shared."""
+        mine = [q for q in self.system.base if q.name in set(own)]
+        self._reduction = Reduction(self.system, mine, self.base.values)
+
+    def reduce(self, values: Values, names: Sequence[str]) -> Reduced | None:
+        """Its information on shared quantities."""
+        return self._reduction.reduce({**self.system.known, **values}, names)
+
+    def alone(self, values: Values, names: Sequence[str]) -> tuple[Fit, Fit]:
+        """The recording fitted alone with these quantities of its candidates, starting at the shared solution.
+
+        In the second fit the standard deviations allow for the autocorrelation of the residuals.
+        """
+        system = self.system
+        known = {q.name: q for c in system.candidates for q in c.quantities}
+        extra = [known[n] for n in names if n in known]
+        found = fit(system, (*system.base, *extra), self._everything(values))
+        growth = inflation(system, found)
+        return found, replace(found, covariance=found.covariance * np.outer(growth, growth))
+
+    def planned(
+        self, values: Values, names: Sequence[str], questions: Sequence[Question], information: Information
+    ) -> Plan:
+        """Further recordings that would answer questions.   information : of all recordings together
+
+        values : of the shared quantities.   names : of those that are not in the base
+        """
+        known = {q.name: q for c in self.system.candidates for q in c.quantities}
+        quantities = (*self.system.base, *(known[n] for n in names))
+        return plan(self.system, no_fit(quantities, self._everything(values)), questions, information=information)
+
+    def _everything(self, shared: Values) -> dict[str, float]:
+        return {**self.base.values, **self._reduction.own_values, **self.system.known, **shared}
 
 
-def in_common(members: Sequence[tuple[Mapping[str, str], DiscSystem]]) -> list[Systematic]:
+def in_common(members: Sequence[tuple[Mapping[str, str], Systematic, list[Array]]]) -> list[Systematic]:
     """Systematic errors that recordings of one rig, or of one disc, share: the largest one found in any of them.
 
     A short recording may not determine an error that it has.
     """
     common: list[Systematic] = []
-    for labels, system in members:
-        rigs = [other for of, other in members if of["rig"] == labels["rig"]]
-        lens = max((s.systematic for s in rigs), key=lambda s: s.lens_px)
-        dots = max((s.systematic for s in rigs), key=lambda s: s.dot_px)
+    for labels, mine, _ in members:
+        rigs = [(s, p) for of, s, p in members if of["rig"] == labels["rig"]]
+        discs = [s for of, s, _ in members if of["disc"] == labels["disc"]]
+        lens = max((s for s, _ in rigs), key=lambda s: s.lens_px)
+        dots = max((s for s, _ in rigs), key=lambda s: s.dot_px)
         common.append(
             replace(
-                system.systematic,
+                mine,
                 lens_px=lens.lens_px,
                 lens_length_px=lens.lens_length_px,
-                lens_places=tuple(np.concatenate([_places(s, camera) for s in rigs]) for camera in range(2)),
+                lens_places=tuple(np.concatenate([p[c] for _, p in rigs]) for c in range(2)),
                 dot_px=dots.dot_px,
                 dot_length_px=dots.dot_length_px,
-                print_m=max(s.systematic.print_m for of, s in members if of["disc"] == labels["disc"]),
+                print_m=max(s.print_m for s in discs),
             )
         )
     return common
-
-
-def _places(system: DiscSystem, camera: int) -> Array:
-    """Positions (k, 2) of the dots in a camera [px]."""
-    rows = evenly(np.arange(len(system.time)), MAX_FRAMES)
-    return np.asarray(system.observed[rows, camera][system.used[rows, camera]], float)

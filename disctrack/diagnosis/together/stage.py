@@ -9,8 +9,7 @@ from disctrack.diagnosis.model_file import PAPER
 from disctrack.diagnosis.recorded import Recorded, read_recorded
 from disctrack.diagnosis.together.output import as_json, figures, report_of
 from disctrack.diagnosis.together.recordings import diagnose_together
-from disctrack.discrepancy.joint.side_by_side import side_by_side
-from disctrack.errors import AnalysisError
+from disctrack.errors import AnalysisError, TrajectoryFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import refuse_existing, write_whole
@@ -30,7 +29,7 @@ def run_together(
     overwrite: bool = False,
     reuse: bool = False,
     settle: bool = False,
-    threads: int = 1,
+    processes: int = 1,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Report:
     """Diagnose trajectory files together; write diagnosis.json and diagnosis.html with figures.
@@ -52,7 +51,7 @@ def run_together(
     folder = Path(output) if output is not None else common / FOLDER
     report, html = folder / "diagnosis.json", folder / "diagnosis.html"
     progress("reading")
-    read, unread = _read(paths, threads)
+    read, unread = _read(paths)
     if not read:
         raise AnalysisError("; ".join(f"{path}: {reason}" for path, reason in unread.items()))
     inputs = {
@@ -72,7 +71,7 @@ def run_together(
         replace(r, name=p.resolve().relative_to(common).as_posix()) if names.count(r.name) > 1 else r
         for p, r in read.items()
     ]
-    result = diagnose_together(recordings, model, threads=threads, progress=progress, settle=settle, unread=unread)
+    result = diagnose_together(recordings, model, processes=processes, progress=progress, settle=settle, unread=unread)
     document = {"files": [str(p) for p in paths], **as_json(result)}
     summary = replace(report_of(result, figures(result), (html, report)), data=document)
     files = write_page(html, summary, ["png"])
@@ -81,11 +80,14 @@ def run_together(
     return summary
 
 
-def _read(paths: Sequence[Path], threads: int) -> tuple[dict[Path, Recorded], dict[str, str]]:
+def _read(paths: Sequence[Path]) -> tuple[dict[Path, Recorded], dict[str, str]]:
     """Recordings by file, and why others cannot be read: one broken file does not stop the diagnosis of the rest."""
-    found = dict(zip(paths, side_by_side(read_recorded, [(path,) for path in paths], threads), strict=True))
-    for path, recorded in found.items():
-        if not path.is_file():  # mistyped
-            raise recorded
-    read = {path: recorded for path, recorded in found.items() if isinstance(recorded, Recorded)}
-    return read, {str(path): str(e).removeprefix(f"{path}: ") for path, e in found.items() if path not in read}
+    read, unread = dict[Path, Recorded](), dict[str, str]()
+    for path in paths:
+        try:
+            read[path] = read_recorded(path)
+        except TrajectoryFileError as error:
+            if not path.is_file():  # mistyped
+                raise
+            unread[str(path)] = str(error).removeprefix(f"{path}: ")
+    return read, unread

@@ -1,4 +1,4 @@
-"""The joint system of many recordings: shared quantities, and what each recording knows of them.
+"""Shared quantities of many recordings, and the joint system of all recordings.
 
 For the search, many recordings are one system, whose samples are recordings. The own quantities of a recording (its
 initial state) are eliminated; what remains is a least-squares problem in the shared quantities alone, a few dozen rows
@@ -14,9 +14,8 @@ import numpy as np
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import eliminate
 from disctrack.discrepancy.elimination import is_linear, prior_rows, projection
-from disctrack.discrepancy.fit import Fit, fit
-from disctrack.discrepancy.joint.side_by_side import side_by_side
-from disctrack.discrepancy.noise import inflation
+from disctrack.discrepancy.fit import fit
+from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
 EACH = "each its own"  # mark of candidates with an amount for each group
@@ -26,68 +25,34 @@ LAWS = ("surface", "air")  # whose laws may have the same constant for another d
 
 @dataclass(frozen=True)
 class Member:
-    """One recording, fitted alone."""
+    """Description of one recording, without its data."""
 
     name: str
-    system: System
-    start: Values  # of base quantities, as fitted to this recording alone, and of those that are held
+    base: tuple[Quantity, ...]
+    candidates: tuple[Candidate, ...]
+    start: Mapping[str, float]  # base quantities, as fitted to this recording alone
+    n_data: int
     labels: Mapping[str, str]  # "disc", "surface", "rig", "air" -> its name
     covariates: Mapping[str, float] = field(default_factory=dict)  # declared: "mass", "radius", ... in SI
 
 
-class Reduction:
-    """A system with some base quantities profiled out: they always have their best values."""
+class Sharing:
+    """Shared quantities of recordings, their candidates, and the corresponding quantities of each member."""
 
-    def __init__(self, system: System, own: Sequence[Quantity], start: Values) -> None:
-        """Own : quantities without bounds.   start : their initial values, and those of quantities that are held."""
-        self.system, self.own, self._start = system, tuple(own), start
-        self.moved = [q for q in own if not is_linear(q)]
-        self._first = self.own_values = {q.name: start.get(q.name, q.null) for q in self.moved}
-
-    def reduce(self, shared: Values, names: Sequence[str]) -> Reduced | None:
-        """The problem in the shared quantities `names`, at the values `shared`; None where there is no prediction."""
-        for start in (self.own_values, self._first):  # from the latest values, or else from the first ones
-            found = fit(self.system, self.own, {**self._start, **shared, **start})
-            if found.converged:
-                self.own_values = {name: found.values[name] for name in start}
-                return self._eliminated(shared, names)
-        return None
-
-    def _eliminated(self, shared: Values, names: Sequence[str]) -> Reduced | None:
-        values = {**self._start, **shared, **self.own_values}
-        common = projection(self.system, self.own, values)
-        values |= dict(zip(common.names, common.null.tolist(), strict=True))
-        residual, derivative = self.system.linearise(values, [*self.own_values, *names])
-        stacked = np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)])
-        if not np.isfinite(stacked).all():
-            return None
-        prior, matrix = prior_rows(self.moved, values)
-        known = np.column_stack([matrix, np.zeros((len(prior), len(names))), prior])
-        _, left = eliminate(np.concatenate([common.cleared(stacked), known]), len(self.moved))
-        return left[:, -1], left[:, :-1]
-
-
-class JointSystem(System):
-    """Recordings that share quantities. A row is the reduced least-squares problem of a recording."""
-
-    def __init__(self, members: Sequence[Member], threads: int = 1) -> None:
-        """Members : in the order of the recordings.   threads : in which they are worked on side by side."""
-        self.members, self._threads = tuple(members), threads
-        self._shared: dict[str, Quantity] = {}
+    def __init__(self, members: Sequence[Member]) -> None:
+        """Members : in the order of the recordings."""
+        self.members = tuple(members)
+        self.base: dict[str, Quantity] = {}
         self._groups: dict[str, dict[str, str]] = {}  # quantity of a law -> group -> shared name
         self._nulls: dict[str, float] = {}
-        own: list[list[Quantity]] = [[] for _ in members]  # of each member, the base quantities that it does not share
+        self._own: list[list[Quantity]] = [[] for _ in members]
         # of each member: shared name -> its quantity, whose difference from null is the sum of theirs
         self.local: list[dict[str, str]] = [{} for _ in members]
         for i, member in enumerate(members):
-            own[i] = [q for q in member.system.base if not self._share_base(i, q)]
-        self.base = tuple(self._shared.values())
+            for q in member.base:
+                self._base_quantity(i, q)
         self.candidates = self._all_candidates()
-        self.time = np.arange(len(members), dtype=float)
-        free = [sum(not np.isfinite(q.prior_sigma) for q in mine) for mine in own]
-        self.weights = np.array([np.sum(m.system.weights) for m in members]) - free
-        each = zip(members, own, strict=True)
-        self._reductions = [Reduction(m.system, mine, m.start) for m, mine in each]
+        self.own = tuple(tuple(own) for own in self._own)  # of each member, the base quantities that it does not share
 
     def all_groups(self) -> dict[str, dict[str, str]]:
         """Quantities of laws that differ from group to group: name -> group -> shared name."""
@@ -127,17 +92,16 @@ class JointSystem(System):
         own = self.group(member, q)
         return sum(self.group(m, q) == own for m in self.members) == 1
 
-    def _share_base(self, i: int, q: Quantity) -> bool:
-        """Enter a base quantity of member i among the shared ones; False if it is the member's own."""
+    def _base_quantity(self, i: int, q: Quantity) -> None:
         member = self.members[i]
         if not q.belongs_to or (is_linear(q) and self._alone(member, q)):
-            return False
+            self._own[i].append(q)
+            return
         group = self.group(member, q)
         shared = self._share(i, q, group)
-        self._shared.setdefault(shared.name, shared)
+        self.base.setdefault(shared.name, shared)
         if not np.isfinite(q.prior_sigma):
             self._groups.setdefault(q.name, {})[group] = shared.name
-        return True
 
     def _share(self, i: int, local: Quantity, group: str) -> Quantity:
         # shared quantities are not projected out beforehand: rows of the joint system are not rows of data
@@ -149,7 +113,7 @@ class JointSystem(System):
     def _all_candidates(self) -> tuple[Candidate, ...]:
         by_name: dict[str, dict[int, Candidate]] = {}
         for i, member in enumerate(self.members):
-            for c in member.system.candidates:
+            for c in member.candidates:
                 if not (c.threshold or c.sought) and all(q.belongs_to for q in c.quantities):
                     by_name.setdefault(c.name, {})[i] = c
         return tuple(variant for having in by_name.values() for variant in self._variants(having))
@@ -191,25 +155,70 @@ class JointSystem(System):
         for name, local in self.local[i].items():
             null = self._nulls[name]
             away = shared.get(name, null) - null
-            if away or name in self._shared:
+            if away or name in self.base:
                 values[local] = values.get(local, null) + away
         return values
 
     def start(self) -> dict[str, float]:
         """Initial values of the shared base quantities: the median over the recordings fitted alone."""
-        found: dict[str, list[float]] = {name: [] for name in self._shared}
+        found: dict[str, list[float]] = {name: [] for name in self.base}
         for member, parts in zip(self.members, self.local, strict=True):
             for name, local in parts.items():
                 if name in found:
                     found[name].append(member.start[local])
         return {name: float(np.median(alone)) for name, alone in found.items()}
 
+
+class Reduction:
+    """A system with some base quantities profiled out: they always have their best values."""
+
+    def __init__(self, system: System, own: Sequence[Quantity], start: Values) -> None:
+        """Own : quantities without bounds.   start : their initial values."""
+        self.system, self.own = system, tuple(own)
+        self.moved = [q for q in own if not is_linear(q)]
+        self._first = self.own_values = {q.name: start.get(q.name, q.null) for q in self.moved}
+
+    def reduce(self, shared: Values, names: Sequence[str]) -> Reduced | None:
+        """The problem in the shared quantities `names`, at the values `shared`; None where there is no prediction."""
+        for start in (self.own_values, self._first):  # from the latest values, or else from the first ones
+            found = fit(self.system, self.own, {**shared, **start})
+            if found.converged:
+                self.own_values = {name: found.values[name] for name in start}
+                return self._eliminated(shared, names)
+        return None
+
+    def _eliminated(self, shared: Values, names: Sequence[str]) -> Reduced | None:
+        values = {**shared, **self.own_values}
+        common = projection(self.system, self.own, values)
+        values |= dict(zip(common.names, common.null.tolist(), strict=True))
+        residual, derivative = self.system.linearise(values, [*self.own_values, *names])
+        stacked = np.column_stack([derivative.reshape(residual.size, -1), residual.reshape(-1)])
+        if not np.isfinite(stacked).all():
+            return None
+        prior, matrix = prior_rows(self.moved, values)
+        known = np.column_stack([matrix, np.zeros((len(prior), len(names))), prior])
+        _, left = eliminate(np.concatenate([common.cleared(stacked), known]), len(self.moved))
+        return left[:, -1], left[:, :-1]
+
+
+class JointSystem(System):
+    """Recordings that share quantities. A row is the reduced least-squares problem of a recording."""
+
+    def __init__(self, sharing: Sharing, crew: Crew) -> None:
+        """Crew : of the members of the sharing, each with a method `reduce` (`Reduction`)."""
+        self.sharing, self._crew = sharing, crew
+        n = len(sharing.members)
+        self.time: Array = np.arange(n, dtype=float)
+        free = [sum(not np.isfinite(q.prior_sigma) for q in own) for own in sharing.own]
+        self.weights: Array = np.array([m.n_data - k for m, k in zip(sharing.members, free, strict=True)], float)
+        self.base: tuple[Quantity, ...] = tuple(sharing.base.values())
+        self.candidates: tuple[Candidate, ...] = sharing.candidates
+
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Rows (n, w) of the reduced problems, padded with zeros, and their derivatives (n, w, k)."""
-        n = len(self.time)
-        local = [self.local_names(i, names) for i in range(n)]
-        each = [(r, self.local_values(i, values), local[i]) for i, r in enumerate(self._reductions)]
-        found = side_by_side(Reduction.reduce, each, self._threads)
+        sharing, n = self.sharing, len(self.time)
+        local = [sharing.local_names(i, names) for i in range(n)]
+        found = self._crew.call("reduce", [(sharing.local_values(i, values), local[i]) for i in range(n)])
         reduced = {i: each for i, each in enumerate(found) if isinstance(each, tuple)}
         width = max([1, *(len(right) for right, _ in reduced.values())])
         residual, derivative = np.full((n, width), np.nan), np.zeros((n, width, len(names)))
@@ -217,31 +226,6 @@ class JointSystem(System):
             residual[i] = 0.0
             residual[i, : len(right)] = right
             for column, name in enumerate(names):
-                if name in self.local[i]:
-                    derivative[i, : len(right), column] = matrix[:, local[i].index(self.local[i][name])]
+                if name in sharing.local[i]:
+                    derivative[i, : len(right), column] = matrix[:, local[i].index(sharing.local[i][name])]
         return residual, derivative
-
-    def local_start(self, i: int, shared: Values) -> dict[str, float]:
-        """Values of the quantities of recording i at these shared ones."""
-        start, own = self.members[i].start, self._reductions[i].own_values
-        return {**start, **own, **self.local_values(i, shared)}
-
-    def local_quantities(self, i: int, names: Sequence[str]) -> tuple[Quantity, ...]:
-        """Base quantities of recording i, and those of its candidates to which these shared ones contribute."""
-        system, local = self.members[i].system, self.local_names(i, names)
-        known = {q.name: q for c in system.candidates for q in c.quantities}
-        return *system.base, *(known[n] for n in local if n in known)
-
-    def alone(self, names: Sequence[str], shared: Values) -> list[Any]:
-        """Each recording fitted alone with these quantities of candidates, beginning at the shared solution.
-
-        Two fits, or an error: in the second one the standard deviations allow for the autocorrelation of the residuals.
-        """
-
-        def fitted(i: int) -> tuple[Fit, Fit]:
-            system = self.members[i].system
-            found = fit(system, self.local_quantities(i, names), self.local_start(i, shared))
-            growth = inflation(system, found)
-            return found, replace(found, covariance=found.covariance * np.outer(growth, growth))
-
-        return side_by_side(fitted, [(i,) for i in range(len(self.time))], self._threads)

@@ -16,8 +16,9 @@ from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.covariates import Hypothesis, hypotheses
+from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.fitting_in import Blocks, ConsistencyTest, inconsistent
-from disctrack.discrepancy.joint.sharing import EACH, JointSystem, Member
+from disctrack.discrepancy.joint.sharing import EACH, JointSystem, Member, Sharing
 from disctrack.discrepancy.score import Linearisation, score_all, sigmas, span
 from disctrack.discrepancy.search import Diagnosis, Settings, explain
 from disctrack.discrepancy.significance import FALSE_ALARM, TWO_SIDED
@@ -76,60 +77,78 @@ class TogetherDiagnosis:
     @property
     def used(self) -> tuple[str, ...]:
         """Names of the recordings that were used."""
-        return tuple(m.name for m in self.system.members)
+        return tuple(m.name for m in self.system.sharing.members)
 
 
 def answer_together(
+    crew: Crew,
     described: Sequence[tuple[str, Mapping[str, str]]],
-    members: Sequence[Member | DiscTrackError],
-    threads: int,
+    in_common: Callable[[list[Any]], list[Any]],
     progress: Callable[[str], None],
+    unread: Mapping[str, str],
 ) -> TogetherDiagnosis:
-    """Joint diagnosis of recordings.
+    """Joint diagnosis of all recordings of the crew.
 
-    described : name and labels of each; no labels of one that cannot be read
-    members : each, or why it cannot be used
-    threads : that share the recordings
+    crew : objects with the methods `summary`, `with_common` (a Member), `share`, `reduce` and `alone` (a Fit, and the
+        same with sigmas that allow for autocorrelated residuals)
+    described : name and labels of each
+    in_common : arguments of `with_common` for all recordings, by their summaries: errors that they share
+    unread : further recordings that are reported as left out, and why
+    The crew keeps the recordings that were used.
     Raises AnalysisError where fewer than two can be used.
     """
     settings = Settings(noise=1.0)
-    names, n = [name for name, _ in described], sum(bool(labels) for _, labels in described)
-    usable = {i: m for i, m in enumerate(members) if isinstance(m, Member)}
-    reasons = {i: str(m) for i, m in enumerate(members) if i not in usable}
-    unusable = tuple(names[i] for i in reasons)
+    names, n = [name for name, _ in described], len(described)
+    summaries = crew.call("summary", [()] * n)
+    reasons = {i: str(s) for i, s in enumerate(summaries) if isinstance(s, DiscTrackError)}
+    kept = [i for i in range(n) if i not in reasons]
+    crew.keep(kept)
+    refitted = crew.call("with_common", [(s,) for s in in_common([summaries[i] for i in kept])])
+    reasons |= {i: str(m) for i, m in zip(kept, refitted, strict=True) if isinstance(m, DiscTrackError)}
+    members: list[Member] = [m for m in refitted if not isinstance(m, DiscTrackError)]
+    kept = [i for i in kept if i not in reasons]
+    unusable = (*(names[i] for i in reasons), *unread)
     while True:
-        kept = [i for i in range(len(members)) if i not in reasons]
         if len(kept) < 2:
-            said = "; ".join(f"{names[i]}: {reason}" for i, reason in list(reasons.items())[:5])
+            left_out = {names[i]: reason for i, reason in reasons.items()} | dict(unread)
+            said = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:5])
             raise AnalysisError(f"fewer than two recordings can be diagnosed together. {said}")
-        system, diagnosis = _search([usable[i] for i in kept], threads, settings, progress)
-        most = len(kept) - (2 * n + 2) // 3
+        crew.keep(kept)
+        system, diagnosis = _search(members, crew, settings, progress)
+        most = len(members) - (2 * n + 2) // 3
         effects = [c for c in system.candidates if not c.name.endswith(f"({EACH})")]
         out = inconsistent(system, diagnosis.after, settings.false_alarm, most, effects)
         if not out:
             break
         for k, effect in out.items():
             reasons[kept[k]] = "does not fit the others" + (f"; it differs most by: {effect}" if effect else "")
+        members = [m for k, m in enumerate(members) if k not in out]
+        kept = [i for k, i in enumerate(kept) if k not in out]
     progress("each recording against the others")
-    diagnosis, alone = _with_autocorrelation(system, diagnosis)
+    diagnosis, alone = _with_autocorrelation(system, diagnosis, crew)
     blocks = Blocks(system, diagnosis.after)
     judged = {kept[k]: (blocks.consistency(k, others), alone[k]) for k, others in blocks.others(range(len(kept)))}
-    by_recording = tuple(
-        OfRecording(name, dict(labels), reasons.get(i, ""), *judged.get(i, ()))
-        for i, (name, labels) in enumerate(described)
+    by_recording = (
+        *(
+            OfRecording(name, dict(labels), reasons.get(i, ""), *judged.get(i, ()))
+            for i, (name, labels) in enumerate(described)
+        ),
+        *(OfRecording(name, {}, reason) for name, reason in unread.items()),
     )
     laws = _bounds(system, diagnosis), _dependences(system, diagnosis)
     return TogetherDiagnosis(diagnosis, system, by_recording, *laws, _notes(by_recording, unusable), unusable)
 
 
 def _search(
-    members: Sequence[Member], threads: int, settings: Settings, progress: Callable[[str], None]
+    members: Sequence[Member], crew: Crew, settings: Settings, progress: Callable[[str], None]
 ) -> tuple[JointSystem, Diagnosis]:
-    system = JointSystem(members, threads)
+    sharing = Sharing(members)
+    crew.call("share", [([q.name for q in own],) for own in sharing.own])
+    system = JointSystem(sharing, crew)
     progress(f"{len(members)} recordings together: {len(system.base)} shared quantities")
     n = len(members)
     training = np.arange(n) % TEST_EVERY != TEST_EVERY - 1 if n >= TEST_EVERY else np.arange(n) == 0
-    return system, _without_variants(explain(system, system.start(), settings, training))
+    return system, _without_variants(explain(system, sharing.start(), settings, training))
 
 
 def _without_variants(diagnosis: Diagnosis) -> Diagnosis:
@@ -143,17 +162,20 @@ def _without_variants(diagnosis: Diagnosis) -> Diagnosis:
     return replace(diagnosis, found=tuple(found))
 
 
-def _with_autocorrelation(system: JointSystem, diagnosis: Diagnosis) -> tuple[Diagnosis, list[Fit | None]]:
+def _with_autocorrelation(system: JointSystem, diagnosis: Diagnosis, crew: Crew) -> tuple[Diagnosis, list[Fit | None]]:
     """With sigmas that allow for autocorrelated residuals; and the fit of each recording alone."""
-    after = diagnosis.after
+    after, sharing = diagnosis.after, system.sharing
     extra = [n for f in diagnosis.found for n in f.candidate.names]
-    alone = [None if isinstance(a, DiscTrackError) else a for a in system.alone(extra, after.values)]
+    requested = [
+        (sharing.local_values(i, after.values), sharing.local_names(i, extra)) for i in range(len(sharing.members))
+    ]
+    alone = [None if isinstance(a, DiscTrackError) else a for a in crew.call("alone", requested)]
     fitted = [(i, *fits) for i, fits in enumerate(alone) if fits is not None and fits[0].converged]
     growth = np.ones(len(after.quantities))
     for k, q in enumerate(after.quantities):
         if np.isfinite(q.prior_sigma):
             continue
-        named = [(*fits, local) for i, *fits in fitted for local in system.local_names(i, [q.name])]
+        named = [(*fits, local) for i, *fits in fitted for local in sharing.local_names(i, [q.name])]
         sigma = np.array([(white.sigma(n), grown.sigma(n)) for white, grown, n in named if white.sigma(n) > 0])
         if sigma.size:
             growth[k] = np.sqrt(max(np.average((sigma[:, 1] / sigma[:, 0]) ** 2, weights=sigma[:, 0] ** -2), 1.0))
@@ -205,9 +227,9 @@ def sigmas_of_first(system: JointSystem, fit_: Fit, numbers: Sequence[int]) -> d
 
 def _dependences(system: JointSystem, diagnosis: Diagnosis) -> tuple[Dependence, ...]:
     """Of every law with a value for each of several groups: relations between these."""
-    after = diagnosis.after
+    after, sharing = diagnosis.after, system.sharing
     found = []
-    for local, groups in system.all_groups().items():
+    for local, groups in sharing.all_groups().items():
         names = [n for n in groups.values() if n in after.names and after.sigma(n) > 0]
         if len(names) < 2 or len(names) < len(groups):
             continue
@@ -215,9 +237,9 @@ def _dependences(system: JointSystem, diagnosis: Diagnosis) -> tuple[Dependence,
         q = after.quantities[after.names.index(names[0])]
         if np.isfinite(q.prior_sigma):  # a tolerance and not a law
             continue
-        tested = hypotheses(values, covariance, system.covariates_of(local), system.kinds_of(local))
+        tested = hypotheses(values, covariance, sharing.covariates_of(local), sharing.kinds_of(local))
         shown = {g: (after.values[n], after.sigma(n)) for g, n in groups.items()}
-        found.append(Dependence(local, q.unit, " and ".join(system.differing(q)), shown, tuple(tested)))
+        found.append(Dependence(local, q.unit, " and ".join(sharing.differing(q)), shown, tuple(tested)))
     return tuple(found)
 
 

@@ -12,29 +12,32 @@ from numpy.testing import assert_allclose
 
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.joint.covariates import equivalent, hypotheses
+from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.fitting_in import Blocks, inconsistent
-from disctrack.discrepancy.joint.sharing import JointSystem
-from disctrack.discrepancy.joint.side_by_side import side_by_side
+from disctrack.discrepancy.joint.sharing import JointSystem, Sharing
 from disctrack.discrepancy.search import Settings, explain
 from disctrack.errors import AnalysisError
-from tests.oracles.decaying_runs import fitted_at_once, member, runs
+from tests.oracles.decaying_runs import DecayMember, fitted_at_once, runs
 
 
-def joint(items, threads=1):
-    return JointSystem([member(item) for item in items], threads)
+def joint(items, processes=1):
+    crew = Crew(DecayMember, items, processes)
+    sharing = Sharing([DecayMember(item).member for item in items])
+    crew.call("share", [([q.name for q in own],) for own in sharing.own])
+    return JointSystem(sharing, crew), crew
 
 
 def answer(items):
-    system = joint(items)
+    system, _ = joint(items)
     n = len(items)
-    return system, explain(system, system.start(), Settings(noise=1.0), np.arange(n) % 3 != 2)
+    return system, explain(system, system.sharing.start(), Settings(noise=1.0), np.arange(n) % 3 != 2)
 
 
 def test_elimination_gives_what_all_quantities_at_once_give(rng):
     items = runs(rng, 6, drag=0.05)
-    system = joint(items)
+    system, _ = joint(items)
     drag = next(c for c in system.candidates if c.name == "drag")
-    found = fit(system, (*system.base, *drag.quantities), system.start())
+    found = fit(system, (*system.base, *drag.quantities), system.sharing.start())
     values, sigmas, cost = fitted_at_once(items, ["drag.c"])
     assert found.converged
     for name, sigma in zip(("friction.g", "drag.c"), sigmas, strict=True):
@@ -77,8 +80,8 @@ def test_of_two_with_a_disc_of_their_own_that_disagree_both_are_named(rng):
 
 
 def named(items, **more):
-    system = joint(items)
-    found = fit(system, system.base, system.start())
+    system, _ = joint(items)
+    found = fit(system, system.base, system.sharing.start())
     return inconsistent(system, found, 0.005, **more), system.candidates
 
 
@@ -100,8 +103,8 @@ def test_a_run_with_a_fault_that_no_shared_number_takes_is_named_with_the_fault(
 def test_differences_in_an_effect_and_to_the_others_are_chi_squares_and_name_nobody_by_chance(rng):
     falls, judged, false = [], [], 0
     for _ in range(40):
-        system = joint(runs(rng, 8))
-        found = fit(system, system.base, system.start())
+        system, _ = joint(runs(rng, 8))
+        found = fit(system, system.base, system.sharing.start())
         blocks = Blocks(system, found, system.candidates)
         for each in blocks.others(range(8)):
             falls.append(blocks.differences(*each))
@@ -121,11 +124,11 @@ def test_runs_that_declare_another_disc_have_a_rate_of_their_own(rng):
     changed |= {f"run_{i}": {"rate": 0.8 * 4**-0.5, "mass": 4.0} for i in range(12, 18)}
     system, found = answer(runs(rng, 18, **changed))
     assert found.verdict == "nothing missing"
-    groups = system.all_groups()["friction.g"]
+    groups = system.sharing.all_groups()["friction.g"]
     assert set(groups) == {"1 kg", "2 kg", "4 kg"}
     index = [found.after.names.index(n) for n in groups.values()]
     values = np.array([found.after.values[n] for n in groups.values()])
-    covariates = system.covariates_of("friction.g")
+    covariates = system.sharing.covariates_of("friction.g")
     assert covariates == {"mass": [1.0, 2.0, 4.0], "density": [1.0, 1.0, 1.0]}
     tested = hypotheses(values, found.after.covariance[np.ix_(index, index)], covariates)
     assert tested[0].text == "in proportion to a power of the mass"
@@ -144,14 +147,14 @@ def test_law_of_the_air_is_told_from_one_that_each_pressure_has_its_own(rng):
     wrong = {f"run_{i}": {"density": 0.1, "drag": 0.4 * 0.1**-0.5} for i in range(6)}
     system, found = answer(runs(rng, 12, drag=0.3, **wrong))
     assert found.found[0].candidate.name == "drag (each its own)"
-    values = np.array([found.after.values[n] for n in system.all_groups()["drag.c"].values()])
+    values = np.array([found.after.values[n] for n in system.sharing.all_groups()["drag.c"].values()])
     assert_allclose(values, [0.4 * 0.1**-0.5, 0.3], atol=0.1)
 
 
 def test_quantities_of_an_undeclared_kind_are_shared_by_all_who_do_not_declare_it(rng):
     items = [(name, data, labels | {"surface": ""}, *more) for name, data, labels, *more in runs(rng, 3)]
     items += runs(rng, 2)
-    system = joint(items)
+    system, _ = joint(items)
     assert [q.name for q in system.base] == ["friction.g[no surface declared]", "friction.g[glass]"]
 
 
@@ -224,40 +227,48 @@ def test_covariates_that_go_together_are_told_as_alternatives_and_values_without
 
 
 @pytest.mark.slow
-def test_the_number_of_threads_changes_no_bit(rng):
+def test_the_number_of_processes_changes_no_bit(rng):
     items = runs(rng, 5, drag=0.05)
     found = []
-    for threads in (1, 2):
-        system = joint(items, threads)
-        found.append(explain(system, system.start(), Settings(noise=1.0)).after)
+    for processes in (1, 2):
+        system, crew = joint(items, processes)
+        with crew:
+            found.append(explain(system, system.sharing.start(), Settings(noise=1.0)).after)
     assert found[0].values == found[1].values
     assert (found[0].covariance == found[1].covariance).all()
 
 
 @pytest.mark.slow
+def test_a_process_that_ends_early_is_an_error_and_no_silence():
+    with Crew(os._exit, [1, 2], 2) as crew, pytest.raises(AnalysisError, match="has ended early"):
+        crew.call("share", [(), ()])
+
+
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-@pytest.mark.parametrize("threads", [1, 2])
-def test_ctrl_c_waits_for_no_recording(tmp_path, threads):
+def test_after_ctrl_c_the_processes_are_gone_without_a_word_of_their_own(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
-        "import time\n"
-        "from disctrack.discrepancy.joint.side_by_side import side_by_side\n"
-        "def begin(item):\n    print(item, flush=True)\n    time.sleep(100)\n"
-        f"side_by_side(begin, [(0,), (1,)], {threads})\n"
+        "from disctrack.discrepancy.joint.crew import Crew\n"
+        "item = r\"import os, time; os.write(1, b'%d\\n' % os.getpid()); time.sleep(100)\"\n"
+        "with Crew(exec, [item, item], 2) as crew:\n    crew.call('share', [(), ()])\n"
     )
     running = subprocess.Popen([sys.executable, script], env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True,
                                stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True)  # fmt: skip
     assert running.stdout is not None
-    for _ in range(threads):
-        running.stdout.readline()
-    os.killpg(running.pid, signal.SIGINT)  # as a terminal does
+    started = [int(running.stdout.readline()) for _ in range(2)]
+    os.killpg(running.pid, signal.SIGINT)  # as a terminal does: all of them get it
     _, said = running.communicate(timeout=20)
     assert said.count("Traceback") == 1  # this script's own
     assert "KeyboardInterrupt" in said
+    for number in started:
+        with pytest.raises(ProcessLookupError):
+            os.kill(number, 0)
 
 
 def test_a_run_that_cannot_be_prepared_is_an_error_in_its_place(rng):
-    good, bad = side_by_side(member, [(item,) for item in (*runs(rng, 1), None)])
-    assert good.name == "run 0"
+    crew = Crew(DecayMember, [*runs(rng, 1), None])
+    good, bad = crew.call("share", [(["state.a", "state.b"],)] * 2)
+    assert good is None
     assert isinstance(bad, AnalysisError)
     assert "TypeError" in str(bad)
