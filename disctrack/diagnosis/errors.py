@@ -112,9 +112,7 @@ class ResidualTests:
 
     pose_chi_square: float = 1.0  # per component of the poses, over the noise
     other_chi_square: float = 1.0  # per component that no pose absorbs, over the noise
-    pose_p_value: float = (
-        1.0  # of the autocorrelation (Ljung-Box) and of the lines in the spectrum of the poses' components
-    )
+    pose_p_value: float = 1.0  # of the autocorrelation (Ljung-Box) and of lines in the spectra of the poses' components
     other_p_value: float = 1.0  # of the autocorrelation of the others
     n_tests: int = 0
 

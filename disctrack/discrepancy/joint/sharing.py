@@ -160,12 +160,15 @@ class Sharing:
         return values
 
     def start(self) -> dict[str, float]:
-        """Initial values of the shared base quantities: the median over the recordings fitted alone."""
+        """Initial values of the shared base quantities: the median over the recordings fitted alone.
+
+        What has a tolerance in one recording may be exact in another, and a candidate there.
+        """
         found: dict[str, list[float]] = {name: [] for name in self.base}
         for member, parts in zip(self.members, self.local, strict=True):
             for name, local in parts.items():
                 if name in found:
-                    found[name].append(member.start[local])
+                    found[name].append(member.start.get(local, self._nulls[name]))
         return {name: float(np.median(alone)) for name, alone in found.items()}
 
 

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from disctrack.discrepancy.joint.fitting_in import Blocks, inconsistent
 from disctrack.discrepancy.joint.sharing import JointSystem, Sharing
 from disctrack.discrepancy.search import Settings, explain
 from disctrack.errors import AnalysisError
-from tests.oracles.decaying_runs import DecayMember, fitted_at_once, runs
+from tests.oracles.decaying_runs import DISC, DecayMember, fitted_at_once, one, runs
 
 
 def joint(items, processes=1):
@@ -272,3 +273,11 @@ def test_a_run_that_cannot_be_prepared_is_an_error_in_its_place(rng):
     assert good is None
     assert isinstance(bad, AnalysisError)
     assert "TypeError" in str(bad)
+
+
+def test_what_has_a_tolerance_in_one_run_may_be_exact_in_another(rng):
+    """The runs of one disc share its growth, of which two of three were fitted without: they begin at none."""
+    first, *others = (DecayMember(item).member for item in runs(rng, 3))
+    (growth,) = one("growth.k", DISC, prior_sigma=0.1)
+    first = replace(first, base=(*first.base, growth), start={**first.start, "growth.k": 0.05})
+    assert Sharing([first, *others]).start()["growth.k"] == 0.0
