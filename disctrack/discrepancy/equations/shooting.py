@@ -23,7 +23,7 @@ from disctrack.discrepancy.system import Quantity, System, Values
 
 FEWEST, SHORT = 10, 0.2  # samples, and share of a period, of a short stretch: over it the motion is nearly linear
 LOST = 0.3  # rms of the residuals over that of the signal, above which the model does not follow the motion
-LOOSE = 0.6  # the same where it does not follow short stretches, but whole runs from a known initial state
+LOOSE = 0.6  # the same of whole runs where it follows less than a period
 _WINDOWS = (8, 12, 18, 27, 40, 60, 90, 135, 200)  # samples of the local polynomial
 _ATTEMPTS = 100  # evaluations of a trust-region fit
 _INSTANTS = 24  # at which the sizes of the states are estimated
@@ -172,14 +172,14 @@ def misfits(system: EquationSystem, values: dict[str, float]) -> Array:
     return np.asarray(np.sqrt(square / np.maximum(size, 1e-300)), float)
 
 
-def levels(system: EquationSystem, share: float = SHORT) -> list[EquationSystem]:
+def levels(system: EquationSystem) -> list[EquationSystem]:
     """Levels of multiple shooting: runs in stretches of a share of a period, joined two by two until they are whole.
 
     At most MOST_STATES initial states are fitted: of the stretches that start where longer ones do.
     """
     most, long = MOST_STATES / len(system.formulas.states), longest_stretches(system)
     spacing = min(float(np.median(np.diff(s.time))) for s in long)
-    duration = max(share * min(period(s) for s in long), FEWEST * spacing)
+    duration = max(SHORT * min(period(s) for s in long), FEWEST * spacing)
     levels: list[list[Samples]] = []
     while not levels or len(levels[-1]) > len(system.stretches):
         levels.append([part for s in system.stretches for part in cut(s, duration)])
@@ -191,15 +191,14 @@ def levels(system: EquationSystem, share: float = SHORT) -> list[EquationSystem]
 
 def fitted_start(system: EquationSystem, values: Values) -> Start:
     """Fit short stretches, and longer and longer ones, until these are whole or the model no longer follows them."""
-    for share in (SHORT, SHORT / 4):  # a drifting or chaotic motion is followed over shorter stretches only
-        found = _fit_over_levels(levels(system, share), values)
-        if found.followed > 0.0:
-            return found
-    # short stretches may not determine an unobserved state, where the known initial state of whole runs does
+    found = _fit_over_levels(levels(system), values)
+    if found.whole or longest_duration(found.system) > min(period(s) for s in longest_stretches(system)):
+        return found
+    # over less than a period the initial states explain most of the motion, and of what is observed only in part, all
     at_once = trust_region(system, [with_weak_prior(q) for q in system.base], initial_guess(system)[0] | dict(values))
     # a median: one of several sensors may show little but the missing effect
-    followed = longest_duration(system) if np.median(misfits(system, at_once)) <= LOOSE else 0.0
-    return Start(system, at_once, followed, followed > 0.0)
+    follows = np.median(misfits(system, at_once)) <= LOOSE
+    return Start(system, at_once, longest_duration(system), True) if follows else found
 
 
 def _fit_over_levels(systems: Sequence[EquationSystem], values: Values) -> Start:

@@ -549,7 +549,6 @@ CASES = {
         ({"x": "1.1*x - 0.4*x*y - 0.02*x**2", "y": "-0.4*y + 0.1*x*y"}, [10.0, 5.0]),
         (np.arange(0, 40, 0.2), {"x": 0.05, "y": 0.05}),
         [*terms.products("x", ["x", "y"], 2), *terms.products("y", ["x", "y"], 2)], {"x_gets_x_x.amount": -0.02},
-        told="whole runs",
     ),
     "a sensor off its zero": case(
         ({"x": "v", "v": "-w**2*x - 2*b*v + g*drive"}, {"w": 6.5, "b": 0.15, "g": 12.0}),
