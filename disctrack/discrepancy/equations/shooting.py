@@ -192,9 +192,10 @@ def levels(system: EquationSystem) -> list[EquationSystem]:
 def fitted_start(system: EquationSystem, values: Values) -> Start:
     """Fit short stretches, and longer and longer ones, until these are whole or the model no longer follows them."""
     found = _fit_over_levels(levels(system), values)
-    if found.whole or longest_duration(found.system) > min(period(s) for s in longest_stretches(system)):
+    followed = longest_duration(found.system) if found.followed else 0.0
+    if found.whole or followed > min(period(s) for s in longest_stretches(system)):
         return found
-    # over less than a period the initial states explain most of the motion, and of what is observed only in part, all
+    # over less than a period the initial states explain nearly any motion, and all of it where some are not observed
     at_once = trust_region(system, [with_weak_prior(q) for q in system.base], initial_guess(system)[0] | dict(values))
     # a median: one of several sensors may show little but the missing effect
     follows = np.median(misfits(system, at_once)) <= LOOSE

@@ -541,6 +541,7 @@ def held(late):
     )  # fmt: skip
 
 
+PHASES = np.random.default_rng(0).uniform(0.0, 2 * np.pi, 24)
 COUPLED = "60*(Max(x - y - 0.005, 0) + Min(x - y + 0.005, 0))"
 CASES = {
     # which the model loses: asked in stretches, and then as a whole
@@ -555,6 +556,15 @@ CASES = {
         ({"x": "v", "v": "-49*(x - 1.5) - 0.4*v + 10*drive"}, [1.5, 0.0]), (np.arange(0, 12, 0.02), {"x": 1e-3}),
         [terms.coulomb("v"), terms.sensor_offset("x")], {"offset_x.b": 1.5, "w": 7.0},
         {"drive": lambda t: np.cos(6.0 * t)}, told="whole runs",
+    ),
+    # over short stretches initial states that nothing observes explain all of it
+    "two filters in a row, of which the second one's output is seen": case(
+        ({"x": "p", "p": "w**2*(u - x) - c*p", "y": "q", "q": "o**2*(g*x - y) - d*q"},
+         {"g": 0.7, "w": 6.5, "c": 7.0, "o": 6.5, "d": 8.0}),
+        ({"x": "p", "p": "49*(u - x) - 8*p", "y": "q", "q": "36*(0.8*x - 0.3*x**2 - y) - 7*q"}, [0.0, 0.0, 0.0, 0.0]),
+        (0.05 * np.arange(400), {"y": 1e-3}), [terms.force("q", "-x**2", "bent"), terms.constant("q")],
+        {"bent.amount": 10.8, "w": 7.0, "c": 8.0, "o": 6.0, "d": 7.0, "g": 0.8},
+        {"u": lambda t: 0.3 * sum(np.cos(0.35 * k * t + phase) for k, phase in enumerate(PHASES, 1))}, sigma=1e-3,
     ),
     # which moves nothing before it begins: its derivative starts from nought at a kink, beside terms of the channel
     "an overflow": tank(
@@ -726,20 +736,18 @@ def test_a_number_of_the_equations_may_have_the_name_of_a_terms_own():
 
 
 @pytest.mark.statistical
-@pytest.mark.parametrize(("at_rest", "seed"), [(True, 0), (False, 0), (False, 1), (False, 5)])
+@pytest.mark.parametrize(("at_rest", "seed"), [(True, 20140703), (False, 20140703), (False, 0), (False, 5)])
 def test_a_sensor_that_lags_shows_the_rest_before_the_first_sample_where_that_is_said(at_rest, seed):
     """A heater is switched on at the first sample: what went on before it is not the heated motion run backwards.
 
-    Without the rest there is a kink, to which no law of T comes nearer than twice the noise, in a single sample.
+    Without the rest there is a kink, which no law of T follows.
     """
     time, lag, sigma = np.arange(90) * 2.0, 12.0, 0.02
     heated = 20 + 30 * (1 - np.exp(-np.maximum(time - lag, 0) / 40))  # closed form
     seen = heated + sigma * np.random.default_rng(seed).standard_normal(90)
     run = Run(time, {"T": seen}, sigma=sigma, known={"T": 20.0}, at_rest=at_rest)
-    answer = diagnose(
-        Equations({"T": "(20 + g - T)/tau"}, {"g": 28.0, "tau": 45.0}), run,
-        [terms.sensor_lag("T"), terms.quadratic("T"), terms.sensor_drift("T")],
-    )  # fmt: skip
+    heater = Equations({"T": "(20 + g - T)/tau"}, {"g": 28.0, "tau": 45.0})
+    answer = diagnose(heater, run, [terms.sensor_lag("T"), terms.quadratic("T"), terms.sensor_drift("T")])
     if at_rest:
         assert_found(answer, ("lag_T",), {"lag_T.tau": lag, "tau": 40.0})
     else:
