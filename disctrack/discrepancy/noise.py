@@ -229,9 +229,9 @@ def _log_likelihood(s: SampleStretch, Q: Array, noise: SmoothNoise) -> float:
     return -0.5 * float(np.sum(white**2)) - s.values.shape[1] * float(np.sum(np.log(np.diag(root))))
 
 
-def far_off(residuals: Array) -> float:
+def outlier_limit(sizes: Array) -> float:
     """Size above which a residual is an outlier, from the median of all sizes, to which outliers do not matter."""
-    return OUTLIER * float(np.nanmedian(np.abs(residuals)) / norm.ppf(0.75))
+    return OUTLIER * float(np.nanmedian(sizes) / norm.ppf(0.75))
 
 
 _ORDERS = range(2, 7)  # of differences: higher ones suppress more of the motion

@@ -617,7 +617,8 @@ class _Search:
 
     def _found(self, e: Explanation, candidate: Candidate, alternatives: list[Alternative]) -> Found:
         without = self._fit(*_without(e, candidate), patient=True)
-        held_gain, gain = self._held_out_gain(without, e.fit), (without.cost - e.fit.cost) / self.noise
+        held_gain = self._held_out_gain(without, e.fit)
+        gain = (without.cost - e.fit.cost) / self.noise
         return Found(candidate, gain, held_gain, self.threshold(len(candidate.names)), tuple(alternatives))
 
     def _all_outcomes(self, scores: Sequence[Score], found: tuple[Found, ...]) -> tuple[Tried, ...]:

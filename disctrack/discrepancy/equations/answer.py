@@ -20,7 +20,7 @@ from disctrack.discrepancy.equations.law import NAME, LearnedForce
 from disctrack.discrepancy.equations.loop import find_missing
 from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.noise import OUTLIER, far_off
+from disctrack.discrepancy.noise import OUTLIER, outlier_limit
 from disctrack.discrepancy.search import Diagnosis, Settings, Verdict
 from disctrack.discrepancy.significance import LAGS, ljung_box, ljung_box_p_value
 from disctrack.discrepancy.system import Candidate, System
@@ -188,7 +188,7 @@ class Answer:
         predicted = self.predicted(self.diagnosis.after)
         for c, channel in enumerate(self.system.formulas.channels):
             left = [np.abs(s.data[:, c] - seen[:, c]) for s, seen in predicted]
-            limit = far_off(np.concatenate(left))
+            limit = outlier_limit(np.concatenate(left))
             off = [(s.run, float(t)) for (s, _), r in zip(predicted, left, strict=True) for t in s.time[r > limit]]
             if limit > 0 and 0 < len(off) < FEW * sum(np.isfinite(r).sum() for r in left):
                 some = ", ".join(f"{run} at {t:.4g} s" for run, t in off[:4]) + (", ..." if len(off) > 4 else "")

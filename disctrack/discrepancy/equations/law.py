@@ -25,7 +25,7 @@ from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem
 from disctrack.discrepancy.fit import TRIAL, Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
-from disctrack.discrepancy.noise import far_off, with_autocorrelation
+from disctrack.discrepancy.noise import outlier_limit, with_autocorrelation
 from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import (
     CLASS_GAIN,
@@ -260,10 +260,11 @@ class _Competition:
         return fitted.converged or fitted.promised < CLASS_GAIN * self.noise
 
     def at_noise(self, system: System, fitted: Fit) -> bool:
-        """As in the search; and does the law follow every sample? The noise may be too large by the few it does not."""
+        """As in the search; and has the law no outliers? A kink that it does not follow raises the noise, too."""
+        if not (self.has_converged(fitted) and is_noise(fitted, self.diagnosis.settings, self.noise)):
+            return False
         size = np.abs(system.linearise(fitted.values, [])[0])
-        follows = not size.max() > far_off(size[size > 0])  # missing data have zeros
-        return follows and self.has_converged(fitted) and is_noise(fitted, self.diagnosis.settings, self.noise)
+        return not size.max() > outlier_limit(size[size > 0])  # missing data have zeros
 
     def known_terms(self) -> list[Candidate]:
         """Known terms that may act with a law: those of the shortest explanations."""
