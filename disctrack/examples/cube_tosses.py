@@ -403,9 +403,10 @@ def example(folder: Path) -> Outcome:
     said += f" Something else is missing: {d.reason}." if d.verdict == "unexplained" else ""
     numbers = {group: (before[group], after[group], noise.white) for group, noise in system.noise.items()}
     rows = [(f"rms {group} (um)", *(rounded(1e6 * x) for x in some)) for group, some in numbers.items()]
+    copies, left_out = len(published) - len(tosses), len(tosses) - len(system.flights)
     caption = (
-        f"{len(system.flights)} flights, each with its cube at rest, of {len(tosses)} tosses; {len(published)} with "
-        "copies, rotated about the vertical. Others are too short or not smooth. Turns: shifts of a face's middle."
+        f"{len(system.flights)} flights, each with its cube at rest; without {left_out} tosses that are too short or "
+        f"not smooth, and {copies} copies of others, rotated about the vertical. Turns are shifts of a face's middle."
     )
     blocks = [Section("Every third toss, held out", [Listing(("", "before", "after", "white noise"), rows, caption)])]
     model = f"g = {GRAVITY} m/s^2, uniform cube, {FRAME_RATE:g} Hz, half width {HALF_WIDTH} m"

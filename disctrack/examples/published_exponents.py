@@ -233,7 +233,7 @@ class ExponentSystem(System):
         spin = own.pop(SPIN)
         reading = {name: own.pop(name) for name in NO_ERRORS if name in own}
         laws = {name: value for name, value in own.items() if value or name == "km.k_m"}
-        return self._last_stage(series, tuple(laws.items()), spin).outcomes(reading)
+        return self._last_stage(series, tuple(sorted(laws.items())), spin).outcomes(reading)
 
 
 def sigmas_off(exponents: Array, predicted: Array) -> float:
