@@ -77,6 +77,16 @@ def test_results_go_into_the_recording_by_default(recording, cli):
         assert cli("run", recording, option, *QUICK).out[:1] == told
 
 
+def test_track_takes_a_range_of_frames_and_keeps_the_length(recording, rig_file, tmp_path, cli):
+    cli("track", recording, "--rig", rig_file, "-o", tmp_path / "part.h5", "--frames", "5:19", *QUICK)
+    trajectory = read_trajectory(tmp_path / "part.h5")
+    assert len(trajectory) == 24
+    assert (trajectory.frame_status[5:19] == FrameStatus.MEASURED).all()
+    assert (np.delete(trajectory.frame_status, range(5, 19)) == FrameStatus.NOT_PROCESSED).all()
+    assert np.isnan(np.delete(trajectory.q, range(5, 19), axis=0)).all()
+    assert_allclose(trajectory.time, np.arange(24) / trajectory.frame_rate, rtol=1e-12)
+
+
 @pytest.mark.statistical
 def test_rest_before_and_after_the_motion_is_left_out_unless_asked_for(recording, cli):
     """100 frames of rest before and after it: its first and its last pair, over and over.

@@ -278,6 +278,6 @@ def test_a_run_that_cannot_be_prepared_is_an_error_in_its_place(rng):
 def test_what_has_a_tolerance_in_one_run_may_be_exact_in_another(rng):
     """The runs of one disc share its growth, of which two of three were fitted without: they begin at none."""
     first, *others = (DecayMember(item).member for item in runs(rng, 3))
-    (growth,) = one("growth.k", DISC, prior_sigma=0.1)
-    first = replace(first, base=(*first.base, growth), start={**first.start, "growth.k": 0.05})
+    base = *first.base, *one("growth.k", DISC, prior_sigma=0.1)
+    first = replace(first, base=base, start={**first.start, "growth.k": 0.05})
     assert Sharing([first, *others]).start()["growth.k"] == 0.0
