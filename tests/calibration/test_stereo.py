@@ -22,7 +22,6 @@ from tests.oracles.drawn_boards import corner_view, draw_board, make_scene
 
 BOARD = Board((7, 4), 9e-3)
 THICKNESS = 2e-3
-NAMES = [(f"left {v}", f"right {v}") for v in range(20)]
 EXACT = BoardTolerances(square=0.0, flatness=0.0, thickness=0.0)  # what is declared of a drawn board is true
 
 

@@ -55,6 +55,11 @@ def contact(now):
     return now.O + now.arm
 
 
+def at_the_place(now, width):
+    """1 where the contact is at PLACE, and little farther from it than the width."""
+    return np.exp(-np.sum((contact(now)[:2] - PLACE) ** 2) / width**2)
+
+
 def force(of):
     """A force at the centre."""
     return lambda disc, now: (ZERO, ZERO, of(disc, now))
@@ -222,15 +227,13 @@ UNKNOWN: dict[str, Unknown] = {
     "stribeck_slip": Unknown(None, 14.0, 1.0, 0.5, friction=lambda v: SLIDING(v) * v / np.sqrt(v * v + 2e-4**2)),
     "low_friction": Unknown(None, 14.0, 1.0, 0.5, friction=lambda v: 0.02 * v / np.sqrt(v * v + 2e-4**2)),
     "viscous_contact": Unknown(None, 14.0, 1.0, 0.5, friction=lambda v: 30.0 * v),
-    "sticky_patch": Unknown(
-        moment(lambda d, n: -6e-4 * np.exp(-np.sum((contact(n)[:2] - PLACE) ** 2) / 0.012**2) * rolling(n))
-    ),
+    "sticky_patch": Unknown(moment(lambda d, n: -6e-4 * at_the_place(n, 0.012) * rolling(n))),
     "dying_force": Unknown(force(lambda d, n: 4e-3 * np.exp(-d.t / 0.15) * level(0.8))),
     "growing_force": Unknown(force(lambda d, n: d.t * np.array([1.2e-3, -3.8e-3, 0.0]))),
     "drag_one_way": Unknown(force(lambda d, n: -0.012 * (n.v @ level(0.5)) * level(0.5))),
     "two_magnets": Unknown(magnets((0.06, 0.02, 0.6, 0.03), (-0.01, 0.05, 0.4, 0.02))),
     "rough_sector": Unknown(
-        by_load(lambda d, n: -2.5e-4 * smooth((np.cos(np.arctan2(n.n0[1], n.n0[0]) - 1.0) - 0.3) / 0.1) * rolling(n))
+        by_load(lambda d, n: -2.5e-4 * smooth((np.cos(azimuth(n) - 1.0) - 0.3) / 0.1) * rolling(n))
     ),
     "friction_steps": Unknown(by_load(lambda d, n: -1.5e-4 * smooth((d.t - 0.35) / 0.005) * rolling(n))),
     "torque_by_attitude": Unknown(moment(lambda d, n: 6e-4 * np.cross(n.d, level(0.4)))),
@@ -262,9 +265,7 @@ UNKNOWN: dict[str, Unknown] = {
     "magnet_over_iron": Unknown(over_iron(3e-11)),
     "seam": Unknown(uneven(seam(0.9, 0.045, 6e-6, 4e-3))),
     "rough_rim": Unknown(by_load(lambda d, n: -2e-4 * smooth((np.cos(n.phi - 1.0) - 0.5) / 0.1) * rolling(n))),
-    "puddle": Unknown(
-        moment(lambda d, n: -1.5e-5 * n.psidot * np.exp(-np.sum((contact(n)[:2] - PLACE) ** 2) / 0.015**2) * n.m0)
-    ),
+    "puddle": Unknown(moment(lambda d, n: -1.5e-5 * n.psidot * at_the_place(n, 0.015) * n.m0)),
     "hinged_frame": Unknown(
         force(lambda d, n: d.m * 9.81 * n.memory[0] * np.array([1.0, 0.0, 0.0])),
         rate_of_memory=lambda d, n, z: (5e-3 * (contact(n)[0] + 0.1) - z) / 0.04,

@@ -8,15 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from calibration.kit.compiled import function_of
 from disctrack import rolling
 from disctrack.disc import MA_2014
-from disctrack.rolling import (
-    CATALOGUE,
-    Model,
-    Regime,
-    _compiled,  # noqa: F401  (which teaches numba complex division)
-    sensitivities,
-    steady_precession,
-)
-from disctrack.rolling._compiled import compile_law
+from disctrack.rolling import CATALOGUE, Model, Regime, sensitivities, steady_precession
+from disctrack.rolling._compiled import compile_law  # of the module that teaches numba complex division
 from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.records import ROLLING_COMPONENTS
 from disctrack.rolling.simulate import COMPONENTS, Assembly, moved_start, responses, symmetries

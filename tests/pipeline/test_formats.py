@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from calibration.rig_file import read_rig
-from disctrack import find_views, iter_pair_blocks, open_pairs, read_recording, read_trajectory
+from disctrack import find_views, open_pairs, read_recording, read_trajectory
 from disctrack.calibrate.views import declared_views
 from disctrack.cli import main
 from disctrack.errors import RecordingError
@@ -21,7 +21,7 @@ from disctrack.trajectory.file import read_details
 from tests.disctrack.recording.readers.written import write_hdf5
 from tests.equality import assert_equal
 from tests.oracles.camera_files import write_mraw
-from tests.pipeline.conftest import QUICK, linked
+from tests.pipeline.conftest import QUICK, images_of, linked
 
 CAMERAS = ("left", "right")
 OURS = {"Record_Rate": "1000", "Shutter_Type2": "50000"}  # of a Photron header: as declared, and 50 µs
@@ -161,14 +161,9 @@ def halves(sample_clip, tmp_path_factory):
     return folder
 
 
-def frames_of(folder: Path) -> np.ndarray:
-    pairs = open_pairs(read_recording(folder), (0, FRAMES))
-    return np.concatenate([b.images.copy() for b in iter_pair_blocks(pairs.left, pairs.right, 0, FRAMES)])
-
-
 @pytest.mark.statistical
 def test_rig_and_poses_are_those_of_two_cameras_to_the_last_bit(halves, sample_clip, tmp_path):
-    np.testing.assert_array_equal(frames_of(halves), frames_of(sample_clip))
+    assert_array_equal(images_of(halves, FRAMES), images_of(sample_clip, FRAMES))
     for folder, result in ((halves, "one"), (sample_clip, "two")):
         asked = ["--frames", f"0:{FRAMES}", *QUICK, "--output", str(tmp_path / result)]
         assert main(["run", str(folder), *asked]) == 0

@@ -137,8 +137,7 @@ def test_dlt_coefficients_describe_the_points_of_xypts(rig, trajectory, tmp_path
     assert "lens" in notes[0]
     L = np.loadtxt(path, delimiter=",")
     motion.write_xypts(tmp_path / "clip_xypts.csv", trajectory)
-    with (tmp_path / "clip_xypts.csv").open() as stream:
-        rows = list(csv.DictReader(stream))
+    rows = list(csv.DictReader((tmp_path / "clip_xypts.csv").read_text().splitlines()))
     body = trajectory.disc.marker_centres_body[4]
     for i in np.flatnonzero(trajectory.measured)[::7]:
         A, b = [], []

@@ -290,7 +290,6 @@ SINGLE = [
     Format("h5", 8, write_hdf5, {**EACH, "chunks": (2, *FRAMES.shape[1:])}),
     *(kind for kind in VIDEOS if kind.bits == 8 and kind.options["pixels"] == "gray"),
 ]
-each_kind = pytest.mark.parametrize("kind", [*PICTURES, *SINGLE], ids=str)
 
 
 def files_in(folder: Path) -> list[Path]:
@@ -412,7 +411,7 @@ def test_a_playlist_under_a_videos_name_opens_no_other_file(tmp_path):
     assert_refused(tmp_path, "list.mkv", "not a readable video")
 
 
-@each_kind
+@pytest.mark.parametrize("kind", [*PICTURES, *SINGLE], ids=str)
 def test_a_file_that_is_cut_or_deleted_while_it_is_read_costs_frames_and_names_them(tmp_path, kind):
     reader = open_frames(kind.written(tmp_path, FRAMES), tmp_path, "left")
     assert np.array_equal(reader.read(0), FRAMES[0])
