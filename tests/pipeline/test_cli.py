@@ -200,11 +200,10 @@ def test_printed_defaults_are_the_default_scene(tmp_path, cli):
     assert repr(read) == repr(Scene())  # to the last bit, and nan is nan
 
 
-def failure(capsys, *words) -> str:
+def failure(cli, *words) -> str:
     """The one line that a failing command prints."""
-    assert main([str(word) for word in words]) == 1
     ended = re.compile(r" *[0-9.]+ s  |compiling the inner loops")  # what went before the failure
-    errors = "".join(line for line in capsys.readouterr().err.splitlines(keepends=True) if not ended.match(line))
+    errors = "".join(line for line in cli(*words, code=1).err.splitlines(keepends=True) if not ended.match(line))
     assert errors.startswith("disctrack: ")
     assert errors.count("\n") == 1
     assert "Traceback" not in errors
@@ -267,10 +266,10 @@ PATTERNS = "calibrate --left {r}/l*.png --right {r}/r*.png --corners 9x6 --squar
         (nothing, "calibrate {r} --left l*.png --square-mm 8", "--left.*recording.toml says this"),
     ],
 )
-def test_what_cannot_be_done_is_said_in_one_line(recording, capsys, spoil, words, said):
+def test_what_cannot_be_done_is_said_in_one_line(recording, cli, spoil, words, said):
     spoil(recording)
     before = {file for file in recording.rglob("*") if file.is_file()}
-    assert re.search(said, failure(capsys, *words.format(r=recording).split()))
+    assert re.search(said, failure(cli, *words.format(r=recording).split()))
     assert {file for file in recording.rglob("*") if file.is_file()} == before
     assert not (recording / "mine.h5").exists() or (recording / "mine.h5").read_text() == "dear"
 
@@ -336,20 +335,20 @@ def empty(file: Path) -> None:
         ),
     ],
 )
-def test_views_that_cannot_be_used_are_named(short_recording, tmp_path, capsys, spoil, said):
+def test_views_that_cannot_be_used_are_named(short_recording, tmp_path, cli, spoil, said):
     spoil(linked(short_recording, tmp_path))
-    assert re.search(said, failure(capsys, "calibrate", tmp_path))
+    assert re.search(said, failure(cli, "calibrate", tmp_path))
 
 
 @pytest.mark.parametrize(("code", "word"), [(errno.EROFS, "Read-only"), (errno.EACCES, "Permission")])
-def test_a_recording_folder_that_is_read_only(recording, monkeypatch, capsys, code, word):
+def test_a_recording_folder_that_is_read_only(recording, monkeypatch, cli, code, word):
     """Simulated: the superuser may write everywhere."""
 
     def refuse(self, *arguments, **named):
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(Path, "mkdir", refuse)
-    message = failure(capsys, "run", recording)
+    message = failure(cli, "run", recording)
     assert word in message
     assert "-o" in message
 
