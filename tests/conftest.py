@@ -17,9 +17,14 @@ from numba.core.event import install_timer
 from disctrack.cli import main
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-CIRCLES = ("statistical", "slow")  # run when they are named: -m statistical, -m slow, or the test itself
+CIRCLES = ("slow", "statistical")  # run when they are named: -m statistical, -m slow, or the test itself
 DEFAULT_TEST_S = 2.0  # of processor time: some two thousand tests share three minutes of two cores
 REFERENCE_S = 0.01  # what `_reference` takes on the processor that the limit was set on
+
+
+def circle_of(item: pytest.Item) -> str | None:
+    """Of a marked test; one case of a statistical test may be slow."""
+    return next(filter(item.get_closest_marker, CIRCLES), None)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -29,8 +34,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     left_out = [
         item
         for item in items
-        if any(item.get_closest_marker(circle) and circle not in named for circle in CIRCLES)
-        and item.nodeid.partition("[")[0] not in asked
+        if (circle := circle_of(item)) and circle not in named and item.nodeid.partition("[")[0] not in asked
     ]
     if left_out:
         config.hook.pytest_deselected(items=left_out)
@@ -54,7 +58,7 @@ def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
         result = yield
     used = _processor_time() - start - sum(compiling)
     item.user_properties.append(("processor_s", round(used, 2)))  # for --junitxml
-    if used > DEFAULT_TEST_S and not any(item.get_closest_marker(circle) for circle in CIRCLES):
+    if used > DEFAULT_TEST_S and not circle_of(item):
         limit = DEFAULT_TEST_S * max(1.0, max(_reference() for _ in range(5)) / REFERENCE_S)
         if used > limit:
             pytest.fail(

@@ -13,6 +13,8 @@ from calibration.rig_file import read_rig_group
 from tests.calibration.test_refinement import rig_error
 from tests.oracles.drawn_boards import squared
 
+pytestmark = pytest.mark.statistical
+
 
 def read_pairs(folder, pattern, indices):
     return [
@@ -29,7 +31,6 @@ def opencv_photographs(shared_data):
     return [[find_corners(image, (9, 6)) for image in side] for side in (left, right)], reference
 
 
-@pytest.mark.statistical
 def test_opencv_photographs_with_their_board_freed(opencv_photographs):
     (left, right), reference = opencv_photographs
     found = calibrate_from_corners(left, right, Board((9, 6), 25e-3))
@@ -59,7 +60,6 @@ def test_halves_of_the_opencv_photographs_agree_within_what_each_states(opencv_p
     assert 0.5 < np.mean(ratios) < 2
 
 
-@pytest.mark.statistical
 def test_sample_clip_gives_the_cameras_it_was_rendered_with(sample_clip):
     with h5py.File(sample_clip.parent / "truth" / "clip.h5") as file:
         truth = read_rig_group(file["rig"])
@@ -78,7 +78,6 @@ def test_sample_clip_gives_the_cameras_it_was_rendered_with(sample_clip):
     assert np.abs(triangulate(truth.project(points), rig) - points).max() < 2e-6
 
 
-@pytest.mark.statistical
 def test_rec_a_lab_frame_is_where_the_views_suggest(shared_data):
     left, right = read_pairs(shared_data / "rec_a" / "calibration", "{side}/{i:02d}.png", range(20))
     found = calibrate_stereo(left, right, Board((9, 6), 8e-3), table_view=0, board_thickness=3e-3)

@@ -14,6 +14,8 @@ from tests.oracles import cast_images
 from tests.oracles.newton_euler import ZERO, classical_rolling_friction, of_the_paper, pivoting_friction
 from tests.oracles.point_laboratory import IDEAL, G, Plan, errors_and_variances, recorded
 
+pytestmark = pytest.mark.statistical
+
 # What frames share counts once in each laboratory: 10 of them scatter by sqrt(2 / 10) of their share.
 SHARED = (0.3, 2.0), (0.5, 1.5)
 # Office printers and rulers: the pattern as a whole is off as well, by what only the dots' scatter tells, of which nine
@@ -105,7 +107,6 @@ def cast(sample_clip, tmp_path_factory):
     return measured, measured(), truth
 
 
-@pytest.mark.statistical
 def test_poses_of_cast_images_are_right_within_their_sigmas(cast):
     _, (trajectory, _), (R, t, _) = cast
     assert np.all(trajectory.frame_status == FrameStatus.MEASURED)
@@ -117,7 +118,6 @@ def test_poses_of_cast_images_are_right_within_their_sigmas(cast):
     assert np.all((error.std(0) ** 2 < 2.0 * noise) & (error.std(0) ** 2 > 0.4 * noise))
 
 
-@pytest.mark.statistical
 def test_lenses_of_cast_images_are_right_within_their_sigmas(cast):
     _, (_, rig), (_, _, cameras) = cast
     for camera, true, first in zip(rig.cameras, cameras, (0, 9), strict=True):
@@ -126,7 +126,6 @@ def test_lenses_of_cast_images_are_right_within_their_sigmas(cast):
         assert np.all(sigma < 3)  # px
 
 
-@pytest.mark.statistical
 def test_squares_declared_too_large_are_errors_beyond_the_sigmas_of_right_ones(cast):
     """Negative control: the same images with squares 0.5 % larger, known to 1 um; by the sigmas of the right run."""
     measured, (right, _), (R, t, _) = cast
