@@ -65,18 +65,14 @@ def significance_text(found: Found) -> str:
 def bounds(found: Found, fit: Fit) -> list[str]:
     """Upper bounds of parameters of the effect that may be zero, and what limits them."""
     texts = []
-    spread = np.array([fit.sigma(name) for name in fit.names])
     for q in found.candidate.quantities:
         name, size = shown(q, fit)
         if q.is_initial or q.reciprocal or q.null != 0.0:  # not an amount
             continue
         if not size.sigma > 0 or abs(size.value) >= TWO_SIDED * size.sigma:
             continue
-        i = fit.names.index(q.name)
-        shared = np.abs(fit.covariance_with(q.name)) / np.where(spread > 0, spread, np.inf) / spread[i]
-        shared[i] = 0.0
-        partner = int(np.argmax(shared))
-        why = f"as {fit.names[partner]} moves with it" if shared[partner] > STRONG else "by the noise"
+        pair = correlated(fit, [q.name], fit.names)
+        why = f"as {pair[0].second} moves with it" if pair else "by the noise"
         most = measured(abs(size.value) + TWO_SIDED * size.sigma, unit=q.unit)
         texts.append(f"{name} is only bounded, |{name}| < {most} (95 %), {why}")
     return texts
@@ -107,24 +103,17 @@ def correlation_text(found: Found, diagnosis: Diagnosis) -> str:
 def correlated(fit: Fit, names: Sequence[str], among: Sequence[str]) -> tuple[Correlated, ...]:
     """The strongest correlation of each of `names` with one of `among`, if it is strong; every pair once."""
     found: dict[frozenset[str], Correlated] = {}
-    for first in names:
-        pairs = [pair for second in among if second != first and (pair := _pair(fit, first, second))]
-        best = max(pairs, key=lambda p: abs(p.correlation), default=None)
-        if best is not None and abs(best.correlation) >= STRONG:
-            found.setdefault(frozenset((best.first, best.second)), best)
+    sigmas = {name: fit.sigma(name) for name in fit.names}
+    for first in (name for name in names if name in fit.shared and sigmas[name] > 0):
+        across = dict(zip(fit.names, fit.covariance_with(first), strict=True))
+        others = {n: across[n] / (sigmas[first] * sigmas[n]) for n in among if n != first and sigmas[n] > 0}
+        second = max(others, key=lambda n: abs(others[n]), default=first)
+        if abs(rho := float(np.clip(others.get(second, 0.0), -1.0, 1.0))) >= STRONG:
+            factor = float(-across[second] / sigmas[second] ** 2)
+            value = float(fit.values[first] + factor * fit.values[second])
+            sigma = float(sigmas[first] * np.sqrt(1.0 - rho**2))
+            found.setdefault(frozenset((first, second)), Correlated(first, second, rho, factor, value, sigma))
     return tuple(found.values())
-
-
-def _pair(fit: Fit, first: str, second: str) -> Correlated | None:
-    if first not in fit.shared or second not in fit.shared:
-        return None
-    (a, cross), (_, b) = fit.amounts([first, second])[1]
-    if not (a > 0 and b > 0):  # one is at its bound
-        return None
-    factor = float(-cross / b)
-    value = fit.values[first] + factor * fit.values[second]
-    rho = float(np.clip(cross / np.sqrt(a * b), -1.0, 1.0))
-    return Correlated(first, second, rho, factor, float(value), float(np.sqrt(max(a - cross * cross / b, 0.0))))
 
 
 def parameters_json(quantities: Any, fit: Fit) -> list[dict[str, Any]]:
