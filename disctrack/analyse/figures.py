@@ -9,7 +9,8 @@ from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS
 from disctrack.disc import MA_2014
 from disctrack.numbers import measured
-from disctrack.report.figures import Curve, Drawn, chart
+from disctrack.report.blocks import Drawn
+from disctrack.report.figures import Curve, chart
 from disctrack.report.palette import AMBER, BLUE, GREEN, INK, MUTED, RED
 
 TIME, X, Y = "time (s)", "x (mm)", "y (mm)"

@@ -60,7 +60,7 @@ def motion_html(analysis: Analysis, name: str, drawn: Drawn | None = None) -> st
     every = f"; every {_stride(trajectory)}th frame is shown" * (_stride(trajectory) > 1)
     said = f"{', '.join(map(' '.join, trajectory.facts().items()))}{every}"
     report = Report(f"{name}: the motion", "", said, carried(trajectory.findings), blocks=[body])
-    return page(report, {}, head=f"<style>{_STYLE}</style>")
+    return page(report, head=f"<style>{_STYLE}</style>")
 
 
 def page_data(analysis: Analysis, drawn: Drawn | None = None) -> dict[str, Any]:

@@ -1,10 +1,7 @@
 """The report of an analysis."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,12 +9,9 @@ from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS, Exponent, PowerLaws
 from disctrack.findings import carried
 from disctrack.numbers import Measured, measured, unit_text
-from disctrack.report.blocks import Cell, Facts, Figures, Listing, Report, Section
+from disctrack.report.blocks import Cell, Drawn, Facts, Figures, Listing, Report, Section
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import Provenance
-
-if TYPE_CHECKING:
-    from disctrack.report.figures import Drawn
 
 # Below, sin and cos of the nutation equal their leading terms to 2e-4, so that the asymptotic exponents hold.
 ASYMPTOTIC_BELOW = np.radians(1.0)

@@ -264,7 +264,7 @@ def _write(found: FoundRecordings, rows: Sequence[Row], options: BatchOptions) -
         "summary.json": json_file(document),
         "summary.csv": as_csv(COLUMNS, rows),
         "repeats.csv": as_csv(REPEATS, repeats),
-        "index.html": page(report_of(rows, repeats, together=together), {}).encode(),
+        "index.html": page(report_of(rows, repeats, together=together)).encode(),
     }
     for name, content in contents.items():
         write_whole(folder / name, content)

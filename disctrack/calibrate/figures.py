@@ -18,7 +18,7 @@ _SHADES = LinearSegmentedColormap.from_list("coverage", ["#e8f1f8", "#a9c6dc"])
 def residuals_figure(found: StereoCalibration) -> Figure:
     """Residuals of the corners as arrows in each image, over the cells that contain any, and their rms per view."""
     figure = Figure(figsize=(12, 9))
-    lay_out(figure, (2, 2), gaps=(0.7, 0.7))
+    lay_out(figure)
     grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
     refinement = found.refinement
     lengths = np.linalg.norm(refinement.residuals[refinement.kept], axis=1)

@@ -6,7 +6,7 @@ A paragraph is a string, a list of sentences a list of strings; other blocks are
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +15,10 @@ from disctrack.findings import Finding, finding_from_json
 from disctrack.numbers import Measured
 
 if TYPE_CHECKING:
-    from disctrack.report.figures import Drawn
+    from matplotlib.figure import Figure
 
 Cell = str | Measured
+Block = Any  # a string, a list of strings, or an instance of the classes below
 
 
 class Markup(str):
@@ -43,6 +44,22 @@ class Listing:
 
 
 @dataclass(frozen=True)
+class Drawn:
+    """One figure with its caption."""
+
+    name: str  # of the file
+    title: str
+    caption: str
+    figure: Figure
+
+    def encoded(self, kind: str) -> bytes:
+        """The figure as a file of this kind ("png", "pdf", "svg")."""
+        from disctrack.report.figures import encoded  # late, as it imports matplotlib
+
+        return encoded(self.figure, kind)
+
+
+@dataclass(frozen=True)
 class Figures:
     """Figures with captions, on pages only."""
 
@@ -54,7 +71,7 @@ class Section:
     """Blocks under a heading; omitted if all are empty."""
 
     title: str
-    blocks: Sequence[Any]  # Block
+    blocks: Sequence[Block]
 
 
 @dataclass(frozen=True)
@@ -66,7 +83,7 @@ class Report:
     accuracy: str = ""  # in one line
     findings: Sequence[Finding] = ()
     facts: Sequence[tuple[str, Cell]] = ()  # the few numbers at the top of a page
-    blocks: Sequence[Any] = ()  # Block
+    blocks: Sequence[Block] = ()
     files: Sequence[Path] = ()
     page: Path | None = None  # with the details
     then: str = ""  # the next command
@@ -77,19 +94,14 @@ class Report:
         return sorted(self.findings, key=lambda f: -f.severity)
 
 
-def is_empty(block: Any) -> bool:
-    """True if a block has no content."""
-    if isinstance(block, (str, list)):
-        return not block
-    content = next(value for name, value in vars(block).items() if name not in ("title", "header"))
-    return all(map(is_empty, content)) if isinstance(block, Section) else not content
-
-
-def figures_in(blocks: Iterable[Any]) -> Iterator[Drawn]:
-    """All figures of the blocks, in order."""
+def shown(blocks: Iterable[Block], omitted: tuple[type, ...] = ()) -> Iterator[Block]:
+    """The blocks that have content, and those of sections likewise.   omitted : classes that a writer leaves out"""
     for block in blocks:
-        yield from block.drawn if isinstance(block, Figures) else []
-        yield from figures_in(block.blocks) if isinstance(block, Section) else []
+        found = replace(block, blocks=[*shown(block.blocks, omitted)]) if isinstance(block, Section) else block
+        parts = vars(found).items() if not isinstance(found, (str, list)) else [("", found)]
+        content = next(value for name, value in parts if name not in ("title", "header"))
+        if content and not isinstance(found, omitted):
+            yield found
 
 
 def document(report: Report) -> dict[str, Any]:
@@ -100,7 +112,7 @@ def document(report: Report) -> dict[str, Any]:
         "accuracy": report.accuracy,
         "findings": [finding.as_json() for finding in report.graver_first()],
         "facts": {name: _cell(value) for name, value in report.facts},
-        "blocks": [shown for block in report.blocks if (shown := _block(block))],
+        "blocks": [_block(block) for block in shown(report.blocks, (Figures, Markup))],
         "files": [str(file) for file in report.files],
         "page": None if report.page is None else str(report.page),
         "next": report.then,
@@ -124,12 +136,9 @@ def _cell(cell: Cell) -> Any:
     return "" if isinstance(cell, Markup) else str(cell)
 
 
-def _block(block: Any) -> dict[str, Any] | None:
+def _block(block: Block) -> dict[str, Any]:
     if isinstance(block, Section):
-        inner = [shown for b in block.blocks if (shown := _block(b))]
-        return {"title": block.title, "blocks": inner} if inner else None
-    if is_empty(block) or isinstance(block, (Figures, Markup)):
-        return None
+        return {"title": block.title, "blocks": [_block(b) for b in block.blocks]}
     if isinstance(block, Facts):
         facts: dict[str, list[object]] = {}
         for name, value in block.rows:

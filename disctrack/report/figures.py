@@ -1,6 +1,5 @@
 """Figures: style of axes, files, and embedding in pages."""
 
-import base64
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,23 +13,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibration.kit.arrays import Array
-from disctrack.files.whole import whole_file
+from disctrack.files.whole import write_whole
 from disctrack.report.palette import GRID, INK, MUTED
 
 DPI = 150
+Margins = tuple[float, float, float, float]
 NO_TITLE = (0.95, 0.15, 0.55, 0.15)  # margins [in] of labelled axes
 BAND = 3.0  # sigmas shown as a band
-LARGE = 400_000  # [bytes] larger vector graphics, of thousands of points, are embedded as a bitmap
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """One figure with its caption."""
-
-    name: str  # of the file
-    title: str
-    caption: str
-    figure: Figure
 
 
 @dataclass(frozen=True)
@@ -73,18 +62,6 @@ def chart(
     return figure
 
 
-def dress(axes: Axes) -> None:
-    """Grid, colours and spines of every plot."""
-    axes.grid(True, color=GRID, linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    for spine in axes.spines.values():
-        spine.set_color(MUTED)
-    axes.tick_params(colors=INK, labelsize=9)
-    axes.xaxis.label.set_color(INK)
-    axes.yaxis.label.set_color(INK)
-
-
 def plain_powers(axis: Axis) -> None:
     """Numbers on a logarithmic axis: 3 and 20, not 3 × 10⁰ and 2 × 10¹; powers of ten if it spans many."""
     low, high = sorted(axis.get_view_interval())
@@ -99,7 +76,7 @@ def panels(
     height: float,
     rows: int = 1,
     columns: int = 1,
-    margins: tuple[float, float, float, float] | None = None,
+    margins: Margins | None = None,
     **options: Any,
 ) -> tuple[Figure, list[Axes]]:
     """A figure [in] with its axes row by row, dressed; options as for matplotlib's `subplots`.
@@ -108,62 +85,37 @@ def panels(
     """
     figure = Figure(figsize=(width, height), layout="constrained" if margins is None else None)
     if margins is not None:
-        lay_out(figure, (rows, columns), margins, (0.9, 0.2))
+        lay_out(figure, margins)
     grid = figure.subplots(rows, columns, squeeze=False, **options)
     for axes in grid.flat:
-        dress(axes)
+        axes.grid(True, color=GRID, linewidth=0.7)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+        for spine in axes.spines.values():
+            spine.set_color(MUTED)
+        axes.tick_params(colors=INK, labelsize=9)
+        axes.xaxis.label.set_color(INK)
+        axes.yaxis.label.set_color(INK)
     return figure, list(grid.flat)
 
 
-def lay_out(
-    figure: Figure,
-    shape: tuple[int, int],
-    margins: tuple[float, float, float, float] = (0.8, 0.2, 0.6, 0.7),
-    gaps: tuple[float, float] = (0.9, 0.6),
-) -> None:
-    """Place a grid of axes with fixed margins: matplotlib's automatic layout takes longer than drawing.
+def lay_out(figure: Figure, margins: Margins = (0.8, 0.2, 0.6, 0.7)) -> None:
+    """Margins [in] left, right, bottom and top of all axes: matplotlib's automatic layout takes longer than drawing."""
+    (width, height), (left, right, bottom, top) = figure.get_size_inches(), margins
+    figure.subplots_adjust(left / width, bottom / height, 1 - right / width, 1 - top / height, 0.24, 0.15)
 
-    shape : rows, columns; margins : left, right, bottom, top [in]; gaps : between columns, between rows [in]
-    """
-    (width, height), (rows, columns), (left, right, bottom, top) = figure.get_size_inches(), shape, margins
-    across = (width - left - right - (columns - 1) * gaps[0]) / columns
-    down = (height - bottom - top - (rows - 1) * gaps[1]) / rows
-    figure.subplots_adjust(
-        left / width, bottom / height, 1 - right / width, 1 - top / height, gaps[0] / across, gaps[1] / down
-    )
+
+def encoded(figure: Figure, kind: str) -> bytes:
+    """The figure as a file of this kind ("png", "pdf", "svg"), without the date."""
+    FigureCanvasAgg(figure)
+    undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
+    content = io.BytesIO()
+    with rc_context({"font.size": 10, "svg.fonttype": "path", "svg.hashsalt": "disctrack", "mathtext.fontset": "cm"}):
+        figure.savefig(content, format=kind, dpi=DPI, metadata=undated.get(kind))
+    return content.getvalue()
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
     """Write a figure atomically; the format is that of the suffix. Raises OutputError."""
-    FigureCanvasAgg(figure)
-    undated = {"CreationDate": None} if path.suffix == ".pdf" else None
-    with whole_file(path) as part:
-        figure.savefig(part, format=path.suffix[1:], dpi=DPI, metadata=undated)
+    write_whole(path, encoded(figure, path.suffix[1:]))
     return path
-
-
-def draw(
-    folder: Path, figures: Sequence[Drawn], kinds: Sequence[str] = ("png", "pdf")
-) -> tuple[list[Path], dict[str, str]]:
-    """Write figures/*.png, *.pdf (`kinds`, may be none); returns them, and a data URI per name. Raises OutputError."""
-    written: list[Path] = []
-    pictures: dict[str, str] = {}
-    with rc_context({"font.size": 10, "svg.fonttype": "path", "svg.hashsalt": "disctrack", "mathtext.fontset": "cm"}):
-        for drawn in figures:
-            FigureCanvasAgg(drawn.figure)
-            if (engine := drawn.figure.get_layout_engine()) is not None:
-                engine.execute(drawn.figure)
-                drawn.figure.set_layout_engine("none")  # laid out once, for all formats
-            written += [save_figure(drawn.figure, folder / "figures" / f"{drawn.name}.{kind}") for kind in kinds]
-            pictures[drawn.name] = _inline(drawn.figure)
-    return written, pictures
-
-
-def _inline(figure: Figure) -> str:
-    """The figure as a data URI: vector graphics, or a bitmap if those exceed LARGE."""
-    for kind, metadata in (("svg", {"Date": None}), ("png", None)):
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format=kind, dpi=DPI, metadata=metadata)
-        if len(buffer.getvalue()) < LARGE:
-            break
-    return f"data:image/{'svg+xml' if kind == 'svg' else kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"

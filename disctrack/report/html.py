@@ -3,36 +3,40 @@
 Text is escaped here, except `Markup`.
 """
 
+import base64
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 from disctrack.files.text import printable
 from disctrack.files.whole import write_whole
-from disctrack.report.blocks import Cell, Facts, Figures, Listing, Markup, Report, Section, figures_in, is_empty
+from disctrack.report.blocks import Block, Cell, Drawn, Facts, Figures, Listing, Markup, Report, Section, shown
 from disctrack.report.palette import AMBER, BLUE, GRID, INK, RED
 
+LARGE = 400_000  # [bytes] larger vector graphics, of thousands of points, are embedded as a bitmap
 SENTENCE = 48  # characters; a longer cell is a sentence, not a number, name or link
 
 
 def write_page(path: Path, report: Report, kinds: Sequence[str] = ()) -> list[Path]:
     """Write the page, and files of its figures of these kinds ("png", "pdf"); returns those. Raises OutputError."""
-    drawn = [*figures_in(report.blocks)]
-    files: list[Path] = []
-    pictures: dict[str, str] = {}
-    if drawn:
-        from disctrack.report.figures import draw  # late, as it imports matplotlib
-
-        files, pictures = draw(path.parent, drawn, kinds)
-    write_whole(path, page(report, pictures).encode())
-    return files
+    folder, drawn = path.parent / "figures", [*_figures_in(report.blocks)]
+    files = {folder / f"{figure.name}.{kind}": figure.encoded(kind) for figure in drawn for kind in kinds}
+    for file, content in [*files.items(), (path, page(report).encode())]:
+        write_whole(file, content)
+    return [*files]
 
 
-def page(report: Report, pictures: Mapping[str, str], head: str = "") -> str:
-    """The whole page. pictures : name of a figure -> data URI;  head : HTML for its head"""
+def _figures_in(blocks: Iterable[Block]) -> Iterator[Drawn]:
+    """All figures of the blocks, in order."""
+    for block in blocks:
+        yield from block.drawn if isinstance(block, Figures) else []
+        yield from _figures_in(block.blocks) if isinstance(block, Section) else []
+
+
+def page(report: Report, head: str = "") -> str:
+    """The whole page. head : HTML for its head"""
     title = escape(report.title)
     findings = "".join(f"<li class={f.grave}><b>{f.grave}</b>{_text(f.sentence)}</li>" for f in report.graver_first())
     tiles = "".join(
@@ -42,9 +46,9 @@ def page(report: Report, pictures: Mapping[str, str], head: str = "") -> str:
         f"<h1>{title}</h1>{NAV[0]}{NAV[1]}",
         f"<ul class=findings>{findings}</ul>" if findings else "",
         f"<p class=lead>{_text(report.verdict)}</p>" if report.verdict else "",
-        _html(report.accuracy, pictures),
+        *map(_html, shown([report.accuracy])),
         f"<div class=tiles>{tiles}</div>" if tiles else "",
-        *(_html(block, pictures) for block in report.blocks),
+        *map(_html, shown(report.blocks)),
     ]
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
@@ -76,12 +80,10 @@ def _text(said: Cell) -> str:
     return said if isinstance(said, Markup) else escape(printable(str(said)))
 
 
-def _html(block: Any, pictures: Mapping[str, str]) -> str:
-    """HTML of a block; empty if it has no content."""
-    if is_empty(block):
-        return ""
+def _html(block: Block) -> str:
+    """HTML of a block that has content."""
     if isinstance(block, Section):
-        inner = "\n".join(html for b in block.blocks if (html := _html(b, pictures)))
+        inner = "\n".join(map(_html, block.blocks))
         return f"<section><h2>{escape(block.title)}</h2>\n{inner}</section>"
     if isinstance(block, str):
         return block if isinstance(block, Markup) else f"<p>{_text(block)}</p>"
@@ -90,13 +92,21 @@ def _html(block: Any, pictures: Mapping[str, str]) -> str:
     if isinstance(block, Facts):
         return _table(Listing(("", ""), block.rows))
     if isinstance(block, Figures):
-        shown = (
-            f'<figure><img src="{pictures[d.name]}" alt="{escape(d.title)}">'
+        drawn = (
+            f'<figure><img src="{_uri(d)}" alt="{escape(d.title)}">'
             f"<figcaption><b>{escape(d.title)}.</b> {escape(d.caption)}</figcaption></figure>"
             for d in block.drawn
         )
-        return f"<div class=gallery>{''.join(shown)}</div>"
+        return f"<div class=gallery>{''.join(drawn)}</div>"
     return _table(block)
+
+
+def _uri(drawn: Drawn) -> str:
+    """The figure as a data URI: vector graphics, or a bitmap if those exceed LARGE."""
+    kind, content = "svg+xml", drawn.encoded("svg")
+    if len(content) >= LARGE:
+        kind, content = "png", drawn.encoded("png")
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def _table(listing: Listing) -> str:

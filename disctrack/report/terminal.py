@@ -6,10 +6,9 @@ import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
-from typing import Any
 
 from disctrack.files.text import printable
-from disctrack.report.blocks import Cell, Facts, Listing, Markup, Report, Section, is_empty
+from disctrack.report.blocks import Block, Cell, Facts, Figures, Listing, Markup, Report, Section, shown
 
 MOST_LINES = 10
 WIDTH = 100  # of lines in a file, and at most in a terminal
@@ -37,7 +36,7 @@ def full(report: Report, width: int = WIDTH) -> list[str]:
     first = _entry("verdict", report.verdict, width) + _entry("accuracy", report.accuracy, width)
     lines = [report.title, ""] if report.title else []
     lines += _around(first, [_entry(f.grave, f.sentence, width) for f in report.graver_first()], report)
-    lines += [*_facts(report.facts, width), *_blocks(report.blocks, width)]
+    lines += [*_facts(report.facts, width), *_blocks(shown(report.blocks, (Figures, Markup)), width)]
     lines += _entry("page", "" if report.page is None else str(report.page), width)
     for i, file in enumerate(report.files):
         lines += _entry("" if i else "files", str(file), width)
@@ -82,21 +81,18 @@ def _wrapped(said: str, width: int, first: str = "", then: str = "") -> list[str
     )  # fmt: skip
 
 
-def _blocks(blocks: Iterable[Any], width: int) -> Iterator[str]:
+def _blocks(blocks: Iterable[Block], width: int) -> Iterator[str]:
     for block in blocks:
-        if is_empty(block):
-            continue
         if isinstance(block, Section):
-            inner = [*_blocks(block.blocks, width)]
-            yield from ["", block.title, *inner] if inner else []
+            yield from ["", block.title, *_blocks(block.blocks, width)]
         elif isinstance(block, str):
-            yield from [] if isinstance(block, Markup) else _wrapped(block, width)
+            yield from _wrapped(block, width)
         elif isinstance(block, list):
             for said in block:
                 yield from _wrapped(said, width, "- ", "  ")
         elif isinstance(block, Facts):
             yield from _facts(block.rows, width)
-        elif isinstance(block, Listing):
+        else:
             yield from _table(block, width)
 
 

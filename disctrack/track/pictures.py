@@ -70,7 +70,7 @@ def dots_figure(trajectory: Trajectory) -> Figure:
     """Residual [px] (observed - projected) of every dot, a row per camera: cloud, mean and its standard error."""
     residuals, m = np.ma.masked_invalid(trajectory.markers_residual_px), trajectory.disc.n_markers
     figure = Figure(figsize=(1.75 * m + 1.0, 5.0))
-    lay_out(figure, (2, 1), gaps=(0.0, 0.3))
+    lay_out(figure)
     reach = 1.3 * float(np.percentile(np.abs(residuals.compressed()), 99.5)) if residuals.count() else 1.0
     middle = 2 * reach * np.arange(m)
     for row, name in enumerate(CAMERAS):

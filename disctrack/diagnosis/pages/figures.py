@@ -1,7 +1,6 @@
 """Figures of a diagnosis: model and measurement superposed, the residual before and after, what was tried."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,7 +15,8 @@ from disctrack.diagnosis.supplement import Supplement, force_of
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import HeldOut
 from disctrack.discrepancy.search import threshold
-from disctrack.report.figures import BAND, Curve, Drawn, chart, panels, plain_powers
+from disctrack.report.blocks import Drawn
+from disctrack.report.figures import BAND, Curve, chart, panels, plain_powers
 from disctrack.report.palette import AMBER, BLUE, GRID, INK, MUTED, RED
 
 N_TRIED = 14
@@ -150,7 +150,8 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     alike = {r.candidate.name for f in diagnosis.found for r in f.cannot_be_told_from}
     colours = [BLUE if t.candidate.name in named else AMBER if t.candidate.name in alike else MUTED for t in tried]
     axes.barh(range(len(tried)), gains, color=colours)
-    axes.set_yticks(range(len(tried)), [t.candidate.name for t in tried])
+    more = np.where(beyond, ": without it nothing fits", "")
+    axes.set_yticks(range(len(tried)), [f"{t.candidate.name}{said}" for t, said in zip(tried, more, strict=True)])
     axes.invert_yaxis()
     axes.set_xscale("log")
     axes.axvline(threshold(result.system, diagnosis.settings, 1), color=RED, lw=1)
@@ -158,9 +159,6 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     axes.set_xlabel(
         "decrease of chi-square when it is added to the model (red line: what noise alone can reach with one number)"
     )
-    style: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "ha": "right", "va": "center"}
-    for row in np.flatnonzero(beyond):
-        axes.annotate("without it nothing fits", (gains[row], row), (-4, 0), color="white", **style)
     caption = "The candidates that explain most. Blue: found; amber: indistinguishable alternatives."
     return Drawn("candidates", "What was tried", caption, figure)
 

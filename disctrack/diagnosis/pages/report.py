@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,10 +14,7 @@ from disctrack.discrepancy.document import effect_text, explanations_table, sign
 from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.findings import Finding, Kind, Severity, of_kind
 from disctrack.numbers import Measured, in_unit, measured, probability, rounded, score
-from disctrack.report.blocks import Cell, Figures, Listing, Report, Section
-
-if TYPE_CHECKING:
-    from disctrack.report.figures import Drawn
+from disctrack.report.blocks import Cell, Drawn, Figures, Listing, Report, Section
 
 MODELS = {PAPER: "rolling with the losses of Ma et al. 2014 (paper)", NONE: "rolling without losses (none)"}
 WORDS = (
@@ -41,7 +37,7 @@ def report_of(
     result: DiscDiagnosis,
     more: Supplement | None,
     recording: str,
-    drawn: "Sequence[Drawn]",
+    drawn: Sequence[Drawn],
     findings: Sequence[Finding],
     files: Sequence[Path],
 ) -> Report:

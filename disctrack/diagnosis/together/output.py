@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,11 +19,8 @@ from disctrack.discrepancy.system import Quantity
 from disctrack.files.json_text import plain
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.numbers import Measured, in_unit, measured, probability, rounded
-from disctrack.report.blocks import Facts, Figures, Listing, Report, Section
+from disctrack.report.blocks import Drawn, Facts, Figures, Listing, Report, Section
 from disctrack.report.palette import AMBER, BLUE, MUTED
-
-if TYPE_CHECKING:
-    from disctrack.report.figures import Drawn
 
 NAMED = 8  # recordings that are named on an axis; more are numbered
 MANY = (
@@ -197,7 +194,7 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
     """Every shared law: its value by each recording alone, and by all together."""
     from matplotlib.ticker import MaxNLocator  # needed for pages only
 
-    from disctrack.report.figures import Drawn, panels
+    from disctrack.report.figures import panels
 
     sharing, after = answer.system.sharing, answer.diagnosis.after
     used = [r for r in answer.recordings if not r.reason]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -22,18 +22,15 @@ from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.noise import OUTLIER, outlier_limit
 from disctrack.discrepancy.search import Diagnosis, Settings, Verdict
-from disctrack.discrepancy.significance import LAGS, ljung_box, ljung_box_p_value
+from disctrack.discrepancy.significance import whiteness
 from disctrack.discrepancy.system import Candidate, System
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file, plain
 from disctrack.files.whole import write_whole
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.numbers import in_unit, probability, rounded
-from disctrack.report.blocks import Figures, Listing, Report, Section
+from disctrack.report.blocks import Drawn, Figures, Listing, Report, Section
 from disctrack.report.terminal import full
-
-if TYPE_CHECKING:
-    from disctrack.report.figures import Drawn
 
 FEW = 0.02  # share of the samples, above which outliers are the noise
 ODD = 2.0  # rms over the median of all runs, above which one is odd
@@ -280,9 +277,8 @@ class Answer:
         for rows, s in zip(self.system.blocks, self.system.stretches, strict=True):
             for c in range(residual.shape[1]):
                 x = residual[rows, c][np.isfinite(s.data[:, c])]
-                lags = min(LAGS, len(x) // 4)
-                if lags:
-                    p_values.append(ljung_box_p_value(float(ljung_box(x[:, None], lags)[0]), len(x), lags))
+                if len(x) > 3:
+                    p_values.append(whiteness(x[:, None], 1.0, {}).p_value)
         return min(1.0, min(p_values) * len(p_values)) if p_values else float("nan")
 
     @property

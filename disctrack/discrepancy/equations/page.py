@@ -10,7 +10,8 @@ from scipy import signal
 
 from disctrack.discrepancy.equations.law import LearnedForce
 from disctrack.numbers import in_unit
-from disctrack.report.figures import BAND, Curve, Drawn, chart, panels
+from disctrack.report.blocks import Drawn
+from disctrack.report.figures import BAND, Curve, chart, panels
 from disctrack.report.html import write_page
 from disctrack.report.palette import BLUE, MUTED, RED
 

@@ -219,7 +219,7 @@ def row(**known):
 
 
 def page_of(*given):
-    return page(report_of(*given), {})
+    return page(report_of(*given))
 
 
 def test_the_page_links_reports_by_paths_that_work_and_shows_what_was_written_as_text():

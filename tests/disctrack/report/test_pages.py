@@ -13,8 +13,7 @@ from disctrack.files.json_text import json_file, json_text, plain
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.numbers import Measured, measured, probability, rounded, score
 from disctrack.report import palette
-from disctrack.report.blocks import Facts, Figures, Listing, Markup, Report, Section, document, restored
-from disctrack.report.figures import Drawn, draw
+from disctrack.report.blocks import Drawn, Facts, Figures, Listing, Markup, Report, Section, document, restored
 from disctrack.report.html import link_pages, page, write_page
 from disctrack.report.terminal import full, short, show
 
@@ -57,7 +56,7 @@ def test_a_page_is_whole_and_shows_text_as_text():
     table = Listing(["a", NASTY], [(NASTY, "1"), (Markup("<b>2</b>"), "3")], NASTY, classes=["done", "failed"])
     doubts = of_kind(Kind.OTHER, Severity.DOUBT, [NASTY])
     found = report(title=NASTY, verdict=NASTY, findings=doubts, blocks=[Section(NASTY, [table])])
-    tree = Tree(page(found, {}))
+    tree = Tree(page(found))
     assert tree.open == []
     assert "script" not in tree.seen
     assert NASTY in tree.cells
@@ -65,20 +64,20 @@ def test_a_page_is_whole_and_shows_text_as_text():
 
 
 def test_nothing_to_show_leaves_no_empty_frame():
-    made = page(report(), {})
+    made = page(report())
     assert "Nothing" not in made
     assert "class=findings" not in made
     assert made.count("<section>") == 1
     assert "Nothing" not in "".join(full(report()))
     with pytest.raises(ValueError, match="zip"):
-        page(report(blocks=[Listing(["a"], [("1",), ("2",)], classes=["done"])]), {})
+        page(report(blocks=[Listing(["a"], [("1",), ("2",)], classes=["done"])]))
 
 
 def test_every_writer_shows_the_same_number():
     kept = json.loads(json_text(document(report())))
     assert kept["blocks"][1]["blocks"][0]["rows"] == [["x", {"value": 6.004e-5, "sigma": 2.1e-7, "unit": "m"}]]
     assert kept["blocks"][1]["blocks"][1]["facts"]["length"][1] == "twice"  # what goes on without a name is not lost
-    assert "60.04 ± 0.21 µm" in page(report(), {})
+    assert "60.04 ± 0.21 µm" in page(report())
     assert any(line.split() == ["x", "60.04", "±", "0.21", "µm"] for line in full(report()))
 
 
@@ -161,14 +160,14 @@ def test_statistics_are_set_as_people_write_them():
 def test_a_figure_is_written_whole_and_shown(tmp_path):
     figure = Figure()
     figure.add_subplot().plot([0, 1], color=palette.BLUE)
-    drawn = Drawn("01_line", "A line", "rises & falls", figure)
-    files, pictures = draw(tmp_path, [drawn])
+    with_figure = report(blocks=[Figures([Drawn("01_line", "A line", "rises & falls", figure)])])
+    files = write_page(tmp_path / "page.html", with_figure, ("png", "pdf"))
     assert [f.name for f in files] == ["01_line.png", "01_line.pdf"]
     assert (tmp_path / "figures/01_line.pdf").read_bytes().startswith(b"%PDF")
-    files, pictures = draw(tmp_path / "page alone", [drawn], ())
-    assert files == []
-    assert not (tmp_path / "page alone").exists()
-    shown = page(report(blocks=[Figures([drawn])]), pictures)
+    alone = tmp_path / "page alone" / "page.html"
+    assert write_page(alone, with_figure) == []
+    assert [*alone.parent.iterdir()] == [alone]
+    shown = alone.read_text()
     assert "data:image/svg+xml;base64," in shown
     assert "rises &amp; falls" in shown
 
@@ -183,7 +182,7 @@ def test_json_holds_no_number_that_json_does_not_know():
 
 def test_sentences_in_cells_wrap_and_long_tables_fold():
     said = "gains 4.57, noise alone reaches 21.6; only bounded: translation_x"
-    made = page(report(blocks=[Listing(["a", "b"], [("1.234 ± 0.001", said), ("2", "short")], folded="All")]), {})
+    made = page(report(blocks=[Listing(["a", "b"], [("1.234 ± 0.001", said), ("2", "short")], folded="All")]))
     assert made.count("<td class=said>") == 2  # all of its column
     assert f"<td class=said>{said}" in made
     assert "<details><summary>All</summary>" in made
