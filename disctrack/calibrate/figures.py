@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 from calibration import StereoCalibration
 from calibration.judge.assessment import cells_of
 from disctrack.frames import CAMERAS
-from disctrack.report.figures import lay_out
+from disctrack.report.figures import panels
 from disctrack.report.palette import COLOURS, INK
 
 _SHADES = LinearSegmentedColormap.from_list("coverage", ["#e8f1f8", "#a9c6dc"])
@@ -17,21 +17,23 @@ _SHADES = LinearSegmentedColormap.from_list("coverage", ["#e8f1f8", "#a9c6dc"])
 
 def residuals_figure(found: StereoCalibration) -> Figure:
     """Residuals of the corners as arrows in each image, over the cells that contain any, and their rms per view."""
-    figure = Figure(figsize=(12, 9))
-    lay_out(figure)
-    grid = figure.add_gridspec(2, 2, height_ratios=(3, 1))
+    figure, grid = panels(12, 9, 2, 2, top=0.7, height_ratios=(3, 1))
     refinement = found.refinement
     lengths = np.linalg.norm(refinement.residuals[refinement.kept], axis=1)
     typical = float(np.median(lengths)) or 1.0
     # the typical arrow is about 1/40 of the image width; one significant digit
     scale = float(f"{found.rig.left.image_size[0] / 40 / typical:.0e}")
-    for camera, name in enumerate(CAMERAS):
-        axes = figure.add_subplot(grid[0, camera])
+    for camera, (name, axes, views) in enumerate(zip(CAMERAS, grid[:2], grid[2:], strict=True)):
         _image_frame(axes, found, camera)
         _arrows(axes, found, camera, scale, 4.0 * typical)
         rms, share = found.rms_per_camera_px[camera], found.assessment.coverage[camera]
         axes.set_title(f"{name}: rms {rms:.4f} px, {share:.0%} of the cells hold a corner", color=INK, fontsize=10)
-    _views(figure.add_subplot(grid[1, :]), found)
+        of_views = np.nan_to_num(found.rms_per_view_px[:, camera])
+        views.bar(range(len(of_views)), of_views, color=COLOURS[name])
+        for view in found.rejected_views:
+            views.text(view, 0, "not used", rotation=90, ha="center", va="bottom", fontsize=7, color=INK)
+        views.xaxis.set_major_locator(MaxNLocator(integer=True))
+        views.set(xlabel="view", ylabel="rms (px)", ylim=(0.0, 1.1 * np.nanmax(found.rms_per_view_px)))
     figure.suptitle(
         f"Calibration residuals (arrows {scale:.0f} times longer; black: unused; shaded: cells with corners)"
     )
@@ -63,18 +65,3 @@ def _arrows(axes: Axes, found: StereoCalibration, camera: int, scale: float, mos
         arrows = scale * arrows * np.minimum(1.0, longest / np.maximum(length, 1e-12))
         pixels = refinement.observations.pixels[mine & select]
         axes.quiver(*pixels.T, *arrows.T, angles="xy", scale_units="xy", scale=1, color=colour, width=0.0015, alpha=0.7)
-
-
-def _views(axes: Axes, found: StereoCalibration) -> None:
-    rms = found.rms_per_view_px
-    place = np.arange(len(rms))
-    for camera, name in enumerate(CAMERAS):
-        axes.bar(place + 0.4 * (camera - 0.5), np.nan_to_num(rms[:, camera]), 0.38, color=COLOURS[name], label=name)
-    for view in found.rejected_views:
-        axes.text(view, 0, "not used", rotation=90, ha="center", va="bottom", fontsize=7, color=INK)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel("view")
-    axes.set_ylabel("rms (px)")
-    axes.set_xlim(-0.6, len(rms) - 0.4)
-    axes.legend(frameon=False, fontsize=8)
-    axes.grid(alpha=0.25, axis="y")

@@ -17,8 +17,6 @@ from disctrack.files.whole import write_whole
 from disctrack.report.palette import GRID, INK, MUTED
 
 DPI = 150
-Margins = tuple[float, float, float, float]
-NO_TITLE = (0.95, 0.15, 0.55, 0.15)  # margins [in] of labelled axes
 BAND = 3.0  # sigmas shown as a band
 
 
@@ -45,7 +43,7 @@ def chart(
 
     size : [in];  equal : same scale of both axes, for positions in a plane;  heights : of the rows, relative
     """
-    figure, found = panels(*size, len(rows), margins=NO_TITLE, sharex=True, height_ratios=heights)
+    figure, found = panels(*size, len(rows), top=0.15, sharex=True, height_ratios=heights)
     for axes, (y_label, curves) in zip(found, rows, strict=True):
         for curve in curves:
             if curve.sigma is not None:
@@ -72,20 +70,16 @@ def plain_powers(axis: Axis) -> None:
 
 
 def panels(
-    width: float,
-    height: float,
-    rows: int = 1,
-    columns: int = 1,
-    margins: Margins | None = None,
-    **options: Any,
+    width: float, height: float, rows: int = 1, columns: int = 1, top: float | None = None, **options: Any
 ) -> tuple[Figure, list[Axes]]:
     """A figure [in] with its axes row by row, dressed; options as for matplotlib's `subplots`.
 
-    margins : as for `lay_out`; by default from the size of all labels
+    top : margin [in] above axes with fixed margins; by default, these are by matplotlib from the size of all labels,
+    which takes longer than drawing
     """
-    figure = Figure(figsize=(width, height), layout="constrained" if margins is None else None)
-    if margins is not None:
-        lay_out(figure, margins)
+    figure = Figure(figsize=(width, height), layout="constrained" if top is None else None)
+    if top is not None:
+        figure.subplots_adjust(0.95 / width, 0.55 / height, 1 - 0.15 / width, 1 - top / height, 0.24, 0.2)
     grid = figure.subplots(rows, columns, squeeze=False, **options)
     for axes in grid.flat:
         axes.grid(True, color=GRID, linewidth=0.7)
@@ -97,12 +91,6 @@ def panels(
         axes.xaxis.label.set_color(INK)
         axes.yaxis.label.set_color(INK)
     return figure, list(grid.flat)
-
-
-def lay_out(figure: Figure, margins: Margins = (0.8, 0.2, 0.6, 0.7)) -> None:
-    """Margins [in] left, right, bottom and top of all axes: matplotlib's automatic layout takes longer than drawing."""
-    (width, height), (left, right, bottom, top) = figure.get_size_inches(), margins
-    figure.subplots_adjust(left / width, bottom / height, 1 - right / width, 1 - top / height, 0.24, 0.15)
 
 
 def encoded(figure: Figure, kind: str) -> bytes:

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from disctrack.frames import CAMERAS
-from disctrack.report.figures import BAND, Curve, chart, lay_out
+from disctrack.report.figures import BAND, Curve, chart, panels
 from disctrack.report.palette import COLOURS, INK, MUTED
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
@@ -69,13 +69,12 @@ def _lost_marked(figure: Figure, trajectory: Trajectory) -> Figure:
 def dots_figure(trajectory: Trajectory) -> Figure:
     """Residual [px] (observed - projected) of every dot, a row per camera: cloud, mean and its standard error."""
     residuals, m = np.ma.masked_invalid(trajectory.markers_residual_px), trajectory.disc.n_markers
-    figure = Figure(figsize=(1.75 * m + 1.0, 5.0))
-    lay_out(figure)
+    figure, grid = panels(1.75 * m + 1.0, 5.0, 2, top=0.7)
     reach = 1.3 * float(np.percentile(np.abs(residuals.compressed()), 99.5)) if residuals.count() else 1.0
     middle = 2 * reach * np.arange(m)
-    for row, name in enumerate(CAMERAS):
+    for row, (name, axes) in enumerate(zip(CAMERAS, grid, strict=True)):
         # one pair of axes for all dots, each in a cell of its own: axes and their ticks cost more than what is in them
-        axes = figure.add_subplot(2, 1, row + 1)
+        axes.grid(False)
         axes.axhline(0, color=MUTED, linewidth=0.6)
         of_dots = residuals[:, row]
         x, y = np.moveaxis(np.ma.masked_outside(of_dots, -reach, reach), -1, 0)

@@ -98,7 +98,7 @@ def residuals(result: DiscDiagnosis) -> Drawn:
     """Measured minus fitted pose, a column per model, with the band of the noise."""
     system, sides = result.system, _sides(result)
     n = len(sides)
-    figure, grid = panels(9.5, 6.2, 4, n, (0.95, 0.15, 0.55, 0.3), sharex=True)
+    figure, grid = panels(9.5, 6.2, 4, n, top=0.3, sharex=True)
     rows = [(0, "x", 1e6, "µm"), (1, "y", 1e6, "µm"), (2, "z", 1e6, "µm"), (4, "θ", 1e3 * np.degrees(1), "mdeg")]
     for column, (fit, _, name, colour) in enumerate(sides):
         error, sigma = system.coordinate_errors(fit.values)
