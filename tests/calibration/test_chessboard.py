@@ -29,6 +29,13 @@ def seen(tilt=TILT, seed=None, board=BOARD, camera=CAMERA, distance=0.36, **draw
     return draw_board(camera, R, t, board, rng=rng, **drawing), project(board.points @ R.T + t, camera)
 
 
+def located(image, counts=(9, 6)):
+    """The corners of a board that is found."""
+    view = find_corners(image, counts)
+    assert isinstance(view, CornerView), view
+    return view
+
+
 @pytest.fixture(scope="module")
 def views():
     """(located, true) corners of views from frontal to steep, edges along the rows and askew."""
@@ -36,9 +43,7 @@ def views():
     # no edges at 0 or 45 deg, where the grid of rays of the drawing itself would show
     for seed, tilt in enumerate([(3, 4, 7), TILT, (-35, 10, 33), (10, -50, 5), (55, 0, -20), (5, 8, 38)]):
         image, true = seen(tilt, 11 + seed)
-        view = find_corners(image, (9, 6))
-        assert isinstance(view, CornerView), view
-        found.append((view, true))
+        found.append((located(image), true))
     return found
 
 
@@ -86,8 +91,7 @@ def test_added_light_shifts_no_corner():
 )
 def test_edges_sharper_than_the_pixel_are_located_as_well(optical_blur):
     image, true = seen((-35, 10, 33), 1, sub=8, sigma=optical_blur)
-    view = find_corners(image, (9, 6))
-    assert isinstance(view, CornerView), view
+    view = located(image)
     assert view.accepted.all()
     assert np.sqrt(np.mean((view.points - true) ** 2)) < 0.005  # the light's limit is 0.002 px
 
@@ -114,8 +118,7 @@ def test_spoiled_images_lose_no_corner_and_state_their_error(how):
         image, true = seen(tilt, seed, sigma=0.4)
         image = spoiled(spoiled(image, how), "jpeg")
         true = (true + 0.5) * 0.6 - 0.5 if how == "small" else true
-        view = find_corners(image, (9, 6))
-        assert isinstance(view, CornerView), view
+        view = located(image)
         assert view.accepted.all()
         error = view.points - true
         squares.append(np.mean(np.einsum("ni,nij,nj->n", error, np.linalg.inv(view.covariance), error)) / 2)
@@ -138,8 +141,7 @@ def test_order_follows_the_dark_side_however_the_board_lies(turn):
 
 def test_a_print_whose_corner_squares_are_light_is_found_as_well():
     image, _ = seen(board=Board((9, 7), 7e-3))
-    dark, light = find_corners(image, (9, 7)), find_corners(image[:, ::-1], (9, 7))  # in a mirror the colours change
-    assert isinstance(light, CornerView)
+    dark, light = located(image, (9, 7)), located(image[:, ::-1], (9, 7))  # in a mirror the colours change
     assert light.accepted.all()
     unflipped = light.points * [-1, 1] + [image.shape[1] - 1, 0]
     grid = unflipped.reshape(7, 9, 2)
@@ -152,9 +154,7 @@ def test_other_boards_are_found_in_their_own_order(counts):
     board = Board(counts, 70e-3 / max(counts))
     assert len(board.orders) == 1
     image, true = seen((20, 15, 130), 1, board)
-    view = find_corners(image, counts)
-    assert isinstance(view, CornerView), view
-    assert_allclose(view.points, true, atol=0.1)  # squares down to 10 px, and blur of 0.6 px
+    assert_allclose(located(image, counts).points, true, atol=0.1)  # squares down to 10 px, and blur of 0.6 px
 
 
 @pytest.mark.statistical
@@ -212,8 +212,7 @@ def test_an_empty_or_noisy_image_holds_no_board(rng):
 def test_a_dirty_corner_is_rejected_with_its_reason():
     image, true = seen(seed=4)
     cv2.circle(image, tuple(int(v) for v in np.rint(true[22] + [3, 2])), 5, 110, -1)
-    view = find_corners(image, (9, 6))
-    assert isinstance(view, CornerView)
+    view = located(image)
     assert not view.accepted[22]
     assert view.reasons[22]
     others = np.delete(np.arange(54), 22)

@@ -45,8 +45,6 @@ def test_a_field_is_of_cubic_splines_whose_first_node_lies_one_spacing_before_th
 def test_field_is_found_and_the_geometry_is_better_for_it(refined):
     scene, (_, bent) = refined
     corrected = fit_lens_field(bent)
-    field = corrected.lens_field
-    assert field is not None
     # all that is left is the corners' own noise: 0.5 to 2 times SIGMA, unequal on the axes
     assert bent.chi_square > 3
     assert corrected.chi_square < 1.25
@@ -61,7 +59,7 @@ def test_field_is_found_and_the_geometry_is_better_for_it(refined):
         return np.std(errors)
 
     plain = length_error(bent.model, None)
-    assert length_error(corrected.model, field) < 0.4 * plain
+    assert length_error(corrected.model, corrected.lens_field) < 0.4 * plain
 
 
 @pytest.mark.statistical

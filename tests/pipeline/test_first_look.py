@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from calibration.board.chessboard import BoardNotFound, find_corners
 from disctrack.cli import main
 from disctrack.commands.options import PAPERS
 from disctrack.disc import MA_2014
 from disctrack.first_look.sequences import find_sequences, pair_cameras
 from disctrack.first_look.targets import PAPERS_MM, board_figure, dots_figure
+from tests.calibration.test_chessboard import located
 from tests.pipeline.conftest import linked
 
 
@@ -152,9 +152,7 @@ def test_printed_dots_lie_where_they_are_declared():
 def test_printed_board_is_the_one_that_is_declared(corners, square):
     sharp, scale = drawn(board_figure(corners, square))
     image = cv2.GaussianBlur(sharp, (0, 0), 1.0)  # as a scanner sees it
-    found = find_corners(image, corners)
-    assert not isinstance(found, BoardNotFound), found
-    grid = found.points.reshape(corners[1], corners[0], 2)
+    grid = located(image, corners).points.reshape(corners[1], corners[0], 2)
     steps = np.concatenate([np.diff(grid, axis=0).reshape(-1, 2), np.diff(grid, axis=1).reshape(-1, 2)])
     assert np.linalg.norm(steps, axis=1) / scale == pytest.approx(square, abs=0.1)
     first, along_j = grid[0, 0], grid[1, 0]

@@ -51,12 +51,20 @@ def measured(rendered_pairs, motion):
     return motion[0][:, 4], [measured_with(images, rendered_pairs, exposure) for exposure in told]
 
 
-def _against_drawn_dots(q, R, found, chosen, rig, disc, look):
-    """Shifts of the template by the smear, by dots drawn along the motion; by the mean of their path; as `found`."""
+def _against_drawn_dots(q, chosen, pairs, look, rate=RATE, lost=()):
+    """Shifts of the template by the smear, by dots drawn along the motion; by the mean of their path; as corrected.
+
+    Before them their size [px], after them the corrections of all frames. lost : frames without a pose
+    """
+    rig, disc, R = pairs.rig, pairs.disc, frames.rotation_from_euler(*np.moveaxis(q[..., 3:], -1, 0))
+    known, where, radius = R[:, 4].copy(), q[:, 4, :3].copy(), 0.5 * disc.marker_diameter
+    known[[*lost]], where[[*lost]] = np.nan, np.nan
+    dots = dots_at(known, where, rig, disc)
+    found = shift_by_exposure(*dots, np.arange(N) / rate, np.full(2, 1 / rate), radius, (look, look))
     expected, by_path, given = [], [], []
     turn = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     circle = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    edge = 0.5 * disc.marker_diameter * np.column_stack([circle, np.zeros(16)])
+    edge = radius * np.column_stack([circle, np.zeros(16)])
     for frame, dot, cameras in chosen:
         points = np.concatenate([disc.marker_centres_body[[dot]], disc.marker_centres_body[dot] + edge])
         outlines = rig.project(points @ np.swapaxes(R[frame], -1, -2) + q[frame, :, None, :3])  # (9, 2, 17, 2)
@@ -71,28 +79,20 @@ def _against_drawn_dots(q, R, found, chosen, rig, disc, look):
             expected.append(smeared - still)
             by_path.append(SIMPSON @ centres - centres[4])
             given.append(found[frame, camera, dot])
-    return np.array(expected), np.array(by_path), np.array(given)
+    size = np.sqrt(np.mean(np.square(expected)))
+    assert size > 0.002
+    return size, np.array(expected), np.array(by_path), np.array(given), found
 
 
 @pytest.mark.statistical
 @pytest.mark.parametrize(("dark", "noise"), [(10000, NoiseModel(4e5, 0.0)), (5000, NoiseModel(1e4, 8.0))])
 def test_the_shift_is_that_of_the_template(motion, rendered_pairs, dark, noise):
     """Against dots drawn along the simulated motion (no renderer, no formula), found by their template."""
-    q, rig, disc = motion[0], rendered_pairs.rig, rendered_pairs.disc
-    R = frames.rotation_from_euler(*np.moveaxis(q[..., 3:], -1, 0))
-    known, where = R[:, 4].copy(), q[:, 4, :3].copy()
-    known[20], where[20] = np.nan, np.nan
-    edge = Edge(0.65, 50000.0, 1 - dark / 50000, noise)
-    exposures = np.array([EXPOSURE, EXPOSURE])
-    radius, dots = 0.5 * disc.marker_diameter, dots_at(known, where, rig, disc)
-    found = shift_by_exposure(*dots, np.arange(N) / RATE, exposures, radius, (edge, edge))
-    assert not found[20].any()
-
     dots = ((3, 0), (9, 1), (14, 2), (28, 3), (33, 4), (37, 0), (6, 2), (11, 4))
     chosen = [(*dot, (0, 1)) for dot in dots]
-    expected, by_path, given = _against_drawn_dots(q, R, found, chosen, rig, disc, edge)
-    size = np.sqrt(np.mean(expected**2))
-    assert size > 0.002  # px
+    edge = Edge(0.65, 50000.0, 1 - dark / 50000, noise)
+    size, expected, by_path, given, found = _against_drawn_dots(motion[0], chosen, rendered_pairs, edge, lost=[20])
+    assert not found[20].any()
     assert np.sqrt(np.mean((given - expected) ** 2)) < 0.25 * size
     assert np.sqrt(np.mean((by_path - expected) ** 2)) > 0.4 * size  # the mean of the path alone is not what is found
 
@@ -100,10 +100,9 @@ def test_the_shift_is_that_of_the_template(motion, rendered_pairs, dark, noise):
 @pytest.mark.statistical
 def test_a_dot_seen_obliquely_is_pulled_as_an_ellipse(rendered_pairs):
     """At 55 deg of nutation, dots up to 75 deg off their normal."""
-    rig, disc = rendered_pairs.rig, rendered_pairs.disc
     rate = 2500.0  # a millisecond would smear them by more than a blur
-    q = rolled(disc, 55, rate)[0]
-    R_cw, t_cw = rig.camera_poses()[0]
+    q = rolled(rendered_pairs.disc, 55, rate)[0]
+    R_cw, t_cw = rendered_pairs.rig.camera_poses()[0]
     to_camera = -t_cw @ R_cw - q[N // 2, 4, :3]
     towards, now = np.arctan2(to_camera[1], to_camera[0]), q[N // 2, 4, 3] - np.pi / 2  # of the camera, of the normal
     q[..., 3] += towards + np.radians(98) - now
@@ -113,12 +112,7 @@ def test_a_dot_seen_obliquely_is_pulled_as_an_ellipse(rendered_pairs):
     oblique = [(int(frame), 0, (0,)) for frame in np.flatnonzero((cosine > 0.27) & (cosine < 0.5))[1:-1:2]]
     assert len(oblique) >= 4
     edge = Edge(0.7, 50000.0, 0.8, NoiseModel(4e5, 0.0))
-    exposures = np.array([1, 1]) / rate
-    radius, dots = 0.5 * disc.marker_diameter, dots_at(R[:, 4], q[:, 4, :3], rig, disc)
-    found = shift_by_exposure(*dots, np.arange(N) / rate, exposures, radius, (edge, edge))
-    expected, _, ellipses = _against_drawn_dots(q, R, found, oblique, rig, disc, edge)
-    size = np.sqrt(np.mean(expected**2))
-    assert size > 0.002  # px
+    size, expected, _, ellipses, _ = _against_drawn_dots(q, oblique, rendered_pairs, edge, rate)
     # single dots scatter by 7e-4 px, with the place of their edge among the pixels that they are drawn with
     assert np.sum(expected * ellipses) / np.sum(ellipses**2) == pytest.approx(1.0, abs=0.12)
     assert np.sqrt(np.mean((ellipses - expected) ** 2)) < 0.35 * size  # as circles of the same area above 0.5

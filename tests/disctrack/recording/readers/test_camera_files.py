@@ -169,19 +169,14 @@ def test_settings_come_from_the_header(tmp_path, rng, kind):
     assert found.as_dict()["exposure"] == found.exposure
 
 
-def test_bits_at_the_high_side_are_used_as_they_are(tmp_path, rng):
-    images = random_codes(rng, 12) << 4
-    write_mraw(tmp_path / "left", images, 16, depth=12, EffectiveBit_Side="Higher")
+@pytest.mark.parametrize(("side", "shift"), [("Higher", 4), ("Lower", 0)])
+def test_values_beyond_the_stated_depth_are_used_and_said_but_not_bits_at_the_high_side(tmp_path, rng, side, shift):
+    images = random_codes(rng, 16 - shift) << shift
+    write_mraw(tmp_path / "left", images, 16, depth=12, EffectiveBit_Side=side)
     reader = open_frames("left.cih", tmp_path, "left")
     assert reader.bit_depth == 16
     assert_array_equal(reader.read(3), images[3])
-
-
-def test_values_beyond_the_stated_depth_are_used_and_said(tmp_path, rng):
-    write_mraw(tmp_path / "left", random_codes(rng, 16), 16, depth=12)
-    reader = open_frames("left.cih", tmp_path, "left")
-    assert reader.bit_depth == 16
-    assert any("grey values go up to" in note for note in reader.notes)
+    assert any("grey values go up to" in note for note in reader.notes) == (side == "Lower")
 
 
 def test_an_impossible_exposure_or_step_is_not_used_and_said(tmp_path, rng):
