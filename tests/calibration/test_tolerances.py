@@ -56,30 +56,29 @@ def test_without_a_table_view_only_the_scale_is_uncertain():
 
 
 def found_shape(rng, stretch=0.0, bow=0.0, sigma=0.005):
-    """The board's shape from noisy corners; stretch along i, middle higher by bow."""
+    """The board's shape from noisy corners, and the rig; stretch along i, middle higher by bow."""
     d = BOARD.points - BOARD.points.mean(0)
     deviation = np.zeros_like(d)
     deviation[:, 0] = stretch * BOARD.points[:, 0]
     deviation[:, 2] = bow * (1 - (d[:, 0] / (5 * BOARD.square)) ** 2)
     scene = make_scene(n_views=14, deviation=deviation)
     refinement = refine_stereo(scene.observations(sigma, rng), scene.model, BOARD.points)
-    return scene, refinement, board_shape(refinement, BOARD.points, 1.0)
+    return scene, refinement, board_shape(refinement, BOARD.points, 1.0), rig_with_covariance(refinement, 0, THICK, 1.0)
 
 
 def test_stretch_and_bow_are_seen_by_the_views(rng):
-    scene, refinement, shape = found_shape(rng, stretch=2e-4, bow=60e-6)
+    scene, refinement, shape, rig = found_shape(rng, stretch=2e-4, bow=60e-6)
     assert abs(shape.stretch - 2e-4) < 4 * shape.stretch_sigma < 1e-4
     # the face as bent touches the table with its ends, one square beyond the corners
     d = (BOARD.points - BOARD.points.mean(0))[:, 0] / (5 * BOARD.square)
     assert abs(shape.lift - 60e-6 * np.mean(1 - d**2)) < 5 * shape.lift_sigma < 5e-6
     # both sides are as likely to be off: half of the stretch is taken for each, so lengths are 0.01 % short
     truth = np.linalg.norm(scene.model.rig.t_right_left)
-    sigma = 4 * np.sqrt(rig_with_covariance(refinement, 0, THICK, 1.0).covariance[21, 21]) / truth
+    sigma = 4 * np.sqrt(rig.covariance[21, 21]) / truth
     assert_allclose(np.linalg.norm(refinement.model.rig.t_right_left) / truth - 1, -1e-4, atol=sigma + 2e-5)
     # and the world's origin lies below corner 0
     corner = refinement.model.points[0] - on_the_table(BOARD.points, shape)
     assert_allclose(corner[:2], 0.0, atol=4 * (shape.stretch_sigma * 0.032 + 0.005 * 0.25e-3))
-    rig = rig_with_covariance(refinement, 0, THICK, 1.0)
     told = with_tolerances(rig, BOARD.points, 0, THICK, BoardTolerances(), shape).allowances
     size = np.linalg.norm(told[0].shift[21:24]) / rig.baseline
     assert_allclose(size, 1e-4, rtol=0.3)  # as large as the error is
@@ -87,9 +86,8 @@ def test_stretch_and_bow_are_seen_by_the_views(rng):
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_board_that_looks_exact_is_taken_for_exact(seed):
-    _, refinement, shape = found_shape(np.random.default_rng(seed))
+    *_, shape, rig = found_shape(np.random.default_rng(seed))
     assert abs(shape.stretch) < 4 * shape.stretch_sigma < 5e-5
-    rig = rig_with_covariance(refinement, 0, THICK, 1.0)
     told = with_tolerances(rig, BOARD.points, 0, THICK, BoardTolerances(), shape).allowances
     assert np.linalg.norm(told[0].shift[21:24]) / rig.baseline < 3 * shape.stretch_sigma
     assert next(a.cause for a in told if a.assumed) == "the board's thickness"

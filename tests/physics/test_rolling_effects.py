@@ -145,6 +145,8 @@ def simulated(theta=0.3, effects=(), times=(0.0, 0.01), **state):
     ("make", "message"),
     [
         (lambda: CATALOGUE["km"](k=1.0), "no parameter 'k'; it has k_m"),
+        (lambda: Model(MA_2014, air_density=-0.1), "a number from 0 to 1000, in kg"),
+        (lambda: Model(MA_2014, gravity=-1.0), "expected a number from 0"),
         (lambda: Model(MA_2014).with_values({"km.mu": 1.0}), "no parameter; effect 'km' has k_m"),
         (lambda: Model(MA_2014).with_values({"kx.mu": 1.0}), "there is no effect 'kx'"),
         (lambda: simulated(effects=(CATALOGUE["km"](), CATALOGUE["km"]())), "twice"),
@@ -169,7 +171,7 @@ def simulated(theta=0.3, effects=(), times=(0.0, 0.01), **state):
     ],
 )
 def test_what_cannot_be_a_model_a_start_or_a_law_is_refused_in_words(make, message):
-    with pytest.raises(ModelError, match=message):
+    with pytest.raises((ArgumentError, ModelError), match=message):
         make()
 
 
@@ -196,10 +198,6 @@ def test_every_law_of_the_air_reads_its_density(name, power):
     assert_allclose(q(Model(MA_2014, effects=(weaker,))), thin, rtol=0, atol=1e-10)
     usual = q(Model(MA_2014, effects=(law,)))
     assert (np.abs(usual - thin).max() > 1e-4) == (power > 0)
-    with pytest.raises(ArgumentError, match="a number from 0 to 1000, in kg"):
-        Model(MA_2014, air_density=-0.1)
-    with pytest.raises(ArgumentError, match="expected a number from 0"):
-        Model(MA_2014, gravity=-1.0)
 
 
 def test_the_published_law_is_that_of_its_formula_and_the_free_power_with_exponent_two():

@@ -5,7 +5,6 @@ import os
 import socket
 import sys
 
-import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +12,7 @@ from disctrack import open_frames, read_recording
 from disctrack.errors import OutputError, RecordingError
 from disctrack.files.inputs import inputs_kept, keep, open_regular, read_regular, refuse_input
 from disctrack.recording.readers.raw import RawFile
+from tests.disctrack.recording.readers.written import write_sequence
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pipes and devices lie elsewhere there")
 
@@ -56,8 +56,7 @@ def test_a_declaration_is_a_regular_file(tmp_path, made, kind):
 
 def test_a_frame_that_became_a_pipe_is_a_lost_frame(tmp_path):
     frame = np.full((8, 9), 7, np.uint8)
-    for i in range(3):
-        cv2.imwrite(str(tmp_path / f"{i}.png"), frame)
+    write_sequence(tmp_path, [frame] * 3, names="012")
     reader = open_frames("*.png", tmp_path, "left")
     (tmp_path / "1.png").unlink()
     pipe(tmp_path / "1.png")

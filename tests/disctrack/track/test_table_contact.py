@@ -1,5 +1,6 @@
 """The table from a rolling disc, in recordings whose table is not where the board says."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -88,8 +89,9 @@ def test_a_pattern_off_the_centre_leans_the_rims_table_within_its_sigma(way):
     ways = off * motions_of_pattern(fits.R_world_body, trajectory.disc)[:, :, :2]
 
     def pull(by_pattern):
-        fresh = replace(shifted, covariance=fits.covariance.copy(), sensitivity=fits.sensitivity.copy())
-        table = table_from_disc(fresh, none.copy(), trajectory.rig, trajectory.disc, "disc", by_pattern=by_pattern)[3]
+        table = table_from_disc(
+            deepcopy(shifted), none.copy(), trajectory.rig, trajectory.disc, "disc", by_pattern=by_pattern
+        )[3]
         return np.abs(table.plane[1:]) / np.hypot(table.sigma, table.board_sigma)[1:]
 
     assert pull(None).max() > 6.0  # negative control: as if the dots' middle were the disc's
@@ -100,9 +102,8 @@ def test_told_is_from_where_on_a_pattern_off_the_centre_shows():
     trajectory, least, doubted = measured(n=200), 0.0, []
     fits, none = poses_of(trajectory)
     for share in (0.0, 0.3, 2.0):
-        copy = replace(fits, covariance=fits.covariance.copy(), sensitivity=fits.sensitivity.copy())
         off = share * least
-        shifted = replace(copy, t_world_body=fits.t_world_body + off * fits.R_world_body[:, :, 0])
+        shifted = replace(deepcopy(fits), t_world_body=fits.t_world_body + off * fits.R_world_body[:, :, 0])
         table = table_from_disc(shifted, none.copy(), trajectory.rig, trajectory.disc)[3]
         least = table.details(trajectory.q[:, 4], trajectory.disc)["least_off_centre"]
         doubted.append(off_centre(table, trajectory.q[:, 4], trajectory.disc) > 0.3 * off)
