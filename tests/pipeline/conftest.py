@@ -4,6 +4,7 @@ import os
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -53,10 +54,20 @@ def linked(recording: Path, folder: Path, link=os.link) -> Path:
     return Path(shutil.copytree(recording, folder, copy_function=copy, ignore=left_out, dirs_exist_ok=True))
 
 
-def naming_rig(declaration: str, rig: Path) -> str:
-    """The declaration with a rig file in place of its views and their table."""
-    start, end = declaration.index("[calibration]"), declaration.index("[gravity]")
-    return f'{declaration[:start]}[calibration]\nrig = "{rig.as_posix()}"\n\n{declaration[end:]}'
+def edit(recording: Path, written: str, found: str) -> None:
+    """Replace what is written in its declaration."""
+    text = (recording / "recording.toml").read_text()
+    assert written in text
+    (recording / "recording.toml").write_text(text.replace(written, found, 1))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+def grey_values(folder: Path) -> np.ndarray:
+    """Of all images in it, in the order of their names."""
+    return np.stack([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in sorted(folder.iterdir())])
 
 
 def images_of(recording, n: int | None = None) -> np.ndarray:
@@ -71,5 +82,8 @@ def recording(short_recording, rig_file, tmp_path) -> Path:
     folder = tmp_path / "recording"
     for camera in ("left", "right"):
         linked(short_recording / camera, folder / camera)
-    (folder / "recording.toml").write_text(naming_rig((short_recording / "recording.toml").read_text(), rig_file))
+    text = (short_recording / "recording.toml").read_text()
+    views_and_table = text[text.index("[calibration]") : text.index("[gravity]")]
+    named = f'[calibration]\nrig = "{rig_file.as_posix()}"\n\n'
+    (folder / "recording.toml").write_text(text.replace(views_and_table, named))
     return folder

@@ -17,7 +17,7 @@ from disctrack.synthetic import recording as render_recording
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory import FrameStatus
 from disctrack.trajectory.file import read_details, read_trajectory
-from tests.pipeline.conftest import QUICK
+from tests.pipeline.conftest import QUICK, contents, edit
 from tests.rendering import SMALL_SCENE
 
 
@@ -47,10 +47,6 @@ def test_frames_missing_in_one_piece_are_lost_one_without_its_pair_is_not_and_ti
     measured(recording, code=3)  # reused, and still incomplete
 
 
-def contents(folder) -> dict[str, bytes]:
-    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
-
-
 OURS = ("left/000003.png", "recording.toml", "rig.h5")
 
 
@@ -66,8 +62,7 @@ def test_no_output_replaces_an_input(recording, rig_file, short_recording, cli, 
     (recording / "views").mkdir()
     (recording / "link.h5").symlink_to(recording / "rig.h5")
     os.link(recording / "rig.h5", recording / "hard.h5")
-    text = (recording / "recording.toml").read_text()
-    (recording / "recording.toml").write_text(text.replace(rig_file.as_posix(), "rig.h5"))
+    edit(recording, rig_file.as_posix(), "rig.h5")
     before = contents(recording)
     source = recording if command == "track" else short_recording
     words = [command, source, "-o", recording / target, "--overwrite", "--no-figures"]

@@ -2,7 +2,6 @@
 
 import os
 import re
-import shutil
 import tomllib
 
 import cv2
@@ -17,6 +16,8 @@ from disctrack.disc import MA_2014
 from disctrack.first_look.sequences import find_sequences, pair_cameras
 from disctrack.first_look.targets import PAPERS_MM, board_figure, dots_figure
 from tests.calibration.test_chessboard import located
+from tests.disctrack.batch.test_queue import touched
+from tests.disctrack.recording.readers.written import write_sequence
 from tests.pipeline.conftest import linked
 
 
@@ -44,10 +45,7 @@ def test_init_finds_cameras_views_and_board_and_leaves_only_what_no_file_tells(s
 def test_a_folder_of_any_name_gets_a_declaration_that_can_be_read(tmp_path):
     folder = tmp_path / 'two\nlines, "quoted" \\ and \x7f'
     for camera in ("left", "right"):
-        (folder / camera).mkdir(parents=True)
-        for i in range(3):
-            cv2.imwrite(str(tmp_path / "frame.png"), np.full((32, 32), 90, np.uint8))
-            shutil.move(tmp_path / "frame.png", folder / camera / f"{i}.png")
+        write_sequence(folder / camera, np.full((3, 32, 32), 90, np.uint8))
     assert main(["init", str(folder)]) == 0
     assert tomllib.loads((folder / "recording.toml").read_text())["name"] == folder.name
 
@@ -80,18 +78,14 @@ def test_init_takes_the_rest_from_an_earlier_recording_of_the_same_disc(sample_c
     ],
 )  # fmt: skip
 def test_cameras_are_told_apart_by_their_names(names, pairs, tmp_path):
-    for name in names:
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).touch()
+    touched(tmp_path, *names)
     found = pair_cameras(find_sequences(tmp_path))
     assert [(pair.left.pattern, pair.right.pattern) for pair in found] == pairs
 
 
 def test_folders_behind_links_are_looked_into_once(tmp_path):
-    for name in ("kept/views/left", "kept/views/right", "take/left", "take/right"):
-        (tmp_path / name).mkdir(parents=True)
-        for i in range(2):
-            (tmp_path / name / f"{i}.png").touch()
+    folders = "kept/views/left", "kept/views/right", "take/left", "take/right"
+    touched(tmp_path, *(f"{folder}/{i}.png" for folder in folders for i in range(2)))
     os.symlink(tmp_path / "kept/views", tmp_path / "take/calibration")
     os.symlink(tmp_path / "take", tmp_path / "take/again")  # leads back to where it lies
     found = {(pair.left.pattern, pair.right.pattern) for pair in pair_cameras(find_sequences(tmp_path / "take"))}

@@ -21,7 +21,7 @@ from disctrack.trajectory.file import read_details
 from tests.disctrack.recording.readers.written import write_hdf5
 from tests.equality import assert_equal
 from tests.oracles.camera_files import write_mraw
-from tests.pipeline.conftest import QUICK, images_of, linked
+from tests.pipeline.conftest import QUICK, edit, grey_values, images_of, linked
 
 CAMERAS = ("left", "right")
 OURS = {"Record_Rate": "1000", "Shutter_Type2": "50000"}  # of a Photron header: as declared, and 50 µs
@@ -36,25 +36,16 @@ def from_png(untouched_file):
 def from_png_of_50_us(short_recording, rig_file, tmp_path_factory):
     """With the exposure declared that the cameras' headers tell."""
     folder = linked(short_recording, tmp_path_factory.mktemp("png") / "recording")
-    file, path = folder / "recording.toml", folder / "trajectory.h5"
-    file.write_text(file.read_text().replace("[cameras]", "[cameras]\nexposure_us = 50", 1))
-    assert main(["track", str(folder), "--rig", str(rig_file), "-o", str(path), *QUICK]) == 0
-    return read_trajectory(path)
-
-
-def grey_values(folder: Path) -> np.ndarray:
-    return np.stack([cv2.imread(str(file), cv2.IMREAD_UNCHANGED) for file in sorted(folder.iterdir())])
+    edit(folder, "[cameras]", "[cameras]\nexposure_us = 50")
+    assert main(["track", str(folder), "--rig", str(rig_file), "-o", str(folder / "trajectory.h5"), *QUICK]) == 0
+    return read_trajectory(folder / "trajectory.h5")
 
 
 def use_files(recording: Path, left: str, right: str) -> None:
     """Let the recording name these instead of its PNG files, which are removed."""
-    file = recording / "recording.toml"
-    text = file.read_text()
     for name, pattern in zip(CAMERAS, (left, right), strict=True):
-        assert f'{name} = "{name}/*.png"' in text
-        text = text.replace(f'{name} = "{name}/*.png"', f'{name} = "{pattern}"')
+        edit(recording, f'{name} = "{name}/*.png"', f'{name} = "{pattern}"')
         shutil.rmtree(recording / name)
-    file.write_text(text)
 
 
 def run(recording: Path, *words: str) -> Path:

@@ -21,7 +21,7 @@ from disctrack.findings import Finding, Kind, Severity, finding_from_json, in_do
 from disctrack.first_look.check import run_check
 from disctrack.frames import CAMERAS
 from disctrack.validate.planted_faults import CHANGES, declare, redrawn, reordered
-from tests.pipeline.conftest import linked
+from tests.pipeline.conftest import grey_values, linked
 
 Plant = Callable[[Path, dict], object]  # into a folder, and into what is declared in it
 
@@ -60,8 +60,7 @@ def stacked(**attributes) -> Plant:
     def plant(folder, tree):
         with h5py.File(folder / "frames.h5", "w") as file:
             for camera in CAMERAS:
-                images = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in sorted((folder / camera).iterdir())]
-                file.create_dataset(camera, data=np.array(images)).attrs.update(attributes)
+                file.create_dataset(camera, data=grey_values(folder / camera)).attrs.update(attributes)
                 tree["cameras"][camera] = f"frames.h5:/{camera}"
 
     return plant
