@@ -8,7 +8,7 @@ own_..., so that formulas given as arguments refer to the parameters of the equa
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain, combinations_with_replacement
+from itertools import chain, combinations, combinations_with_replacement
 
 import numpy as np
 
@@ -26,10 +26,23 @@ def _shown(channel: str, formula: str, name: str, title: str, **parameters: Para
     return Term(name, observed={channel: formula}, parameters=parameters, title=title)
 
 
-def coulomb(v: str, load: str = "1", name: str = "") -> Term:
-    """Dry friction against the motion: of constant size, or in proportion to a load (a formula)."""
-    title = f"dry friction on {v}{'' if load == '1' else f', by the load {load}'}"
-    return _on(v, f"-own_c*abs({load})*sign({v})", name or f"coulomb_{v}", title, "Coulomb 1785", c=_POSITIVE)
+def _vector(v: str | Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Direction and size of a velocity, or of the vector of several, as formulas for the equation of each."""
+    if isinstance(v, str):
+        return {v: (f"sign({v})", f"abs({v})")}
+    size = f"sqrt({' + '.join(f'({u})**2' for u in v)})"
+    return {u: (f"({u})/{size}", size) for u in v}
+
+
+def coulomb(v: str | Sequence[str], load: str = "1", name: str = "") -> Term:
+    """Dry friction against the motion: of constant size, or in proportion to a load (a formula).
+
+    v : several are components of one velocity, as of a puck on a table
+    """
+    rates = {u: f"-own_c*abs({load})*{direction}" for u, (direction, _) in _vector(v).items()}
+    label, by = f"coulomb_{'_'.join(rates)}", "" if load == "1" else f", by the load {load}"
+    title = f"dry friction on {' and '.join(rates)}{by}"
+    return Term(name or label, rates, parameters={"c": _POSITIVE}, title=title, source="Coulomb 1785")
 
 
 def stribeck(v: str, name: str = "") -> Term:
@@ -50,10 +63,17 @@ def deflected(v: str, x: str, name: str = "") -> Term:
     return _on(v, f"-own_c*({x})**2*({v})", name or f"deflected_{v}", title, "van der Pol 1926", c=_ANY)
 
 
-def quadratic(v: str, name: str = "") -> Term:
-    """Drag in proportion to the square of the velocity."""
-    title = f"quadratic drag on {v}"
-    return _on(v, f"-own_c*abs({v})*({v})", name or f"quadratic_{v}", title, "Newton 1687", c=_POSITIVE)
+def quadratic(v: str | Sequence[str], name: str = "") -> Term:
+    """Drag in proportion to the square of the velocity.   v : several are components of one, as of a thrown ball"""
+    rates = {u: f"-own_c*{size}*({u})" for u, (_, size) in _vector(v).items()}
+    label, title = f"quadratic_{'_'.join(rates)}", f"quadratic drag on {' and '.join(rates)}"
+    return Term(name or label, rates, parameters={"c": _POSITIVE}, title=title, source="Newton 1687")
+
+
+def across(v: str, w: str, name: str = "") -> Term:
+    """A force across the velocity with components v and w: Coriolis's, of a magnetic field, of a ball's spin."""
+    rates, title = {v: f"own_a*({w})", w: f"-own_a*({v})"}, f"force across the velocity {v} and {w}"
+    return Term(name or f"across_{v}_{w}", rates, parameters={"a": _ANY}, title=title, source="Coriolis 1835")
 
 
 def power_law(v: str, exponent: float = 1.5, name: str = "") -> Term:
@@ -70,6 +90,15 @@ def constant(v: str, name: str = "") -> Term:
 def spring(v: str, x: str, name: str = "") -> Term:
     """Linear spring on a coordinate."""
     return _on(v, f"-own_k*({x})", name or f"spring_{x}", f"linear spring on {x}", k=_ANY)
+
+
+def coupling(v: str, x: str, w: str, y: str, name: str = "") -> Term:
+    """In proportion to x - y: a spring between coordinates, an exchange between levels; v and w are what it changes.
+
+    What it gives to one and takes from the other differs if their masses or capacities do.
+    """
+    rates, title = {v: f"-own_a*({x} - {y})", w: f"own_b*({x} - {y})"}, f"linear coupling of {x} and {y}"
+    return Term(name or f"coupling_{x}_{y}", rates, parameters={"a": _ANY, "b": _ANY}, title=title)
 
 
 def asymmetric_spring(v: str, x: str, name: str = "") -> Term:
@@ -207,7 +236,7 @@ def usual(equations: Equations) -> tuple[Term, ...]:
 
     A coordinate is a state whose declared rate is another state: rates={"x": "v", "v": ...}; that one is a velocity, on
     which friction and springs act. Any other state is a level (of a tank, a charge, a temperature): it leaks, is fed,
-    runs over into the first of the states that it drives.
+    runs over into the first of the states that it drives. Coordinates in one unit may be those of a point, or coupled.
     """
     found: list[Term] = []
     written = {y: str(f).strip() for y, f in equations.rates.items()}
@@ -223,6 +252,15 @@ def usual(equations: Equations) -> tuple[Term, ...]:
         powers = asymmetric_spring(y, y, f"square_{y}"), cubic_spring(y, y, f"cube_{y}")
         found += [replace(p, title=f"loss of {y} by its {p.name.partition('_')[0]}") for p in powers]
         found.append(overflow(equations, y, fed))
+    groups: dict[tuple[bool, str], list[str]] = {}  # coordinates, or levels, in the same unit
+    for x in (x for x in written if x not in pairs.values()):
+        groups.setdefault((x in pairs, equations.units.get(x, "1")), []).append(x)
+    for (move, _), several in groups.items():
+        if move and len(several) > 1:
+            velocities = [pairs[x] for x in several]
+            found += [quadratic(velocities), coulomb(velocities)]
+            found += [across(v, w) for v, w in combinations(velocities, 2)]
+        found += [coupling(pairs.get(x, x), x, pairs.get(y, y), y) for x, y in combinations(several, 2)]
     for x, v in pairs.items():
         found += [spring(v, x), asymmetric_spring(v, x), cubic_spring(v, x), deflected(v, x)]
     observed = equations.observed if equations.observed is not None else {}

@@ -466,6 +466,15 @@ def ending(friction, **sized):
     )  # fmt: skip
 
 
+def resisted(by, g, sized):
+    """In a plane, with viscous friction too; the force against the velocity is this factor times the velocity."""
+    return case(
+        ({"x": "v", "y": "w", "v": "-c*v", "w": "-g - c*w"}, {"g": 0.97 * g, "c": 0.4}),
+        ({"x": "v", "y": "w", "v": f"-(0.5 + {by})*v", "w": f"-{g} - (0.5 + {by})*w"}, [0.0, 0.0, 9.0, 6.0]),
+        (0.01 * np.arange(300), {"x": 2e-3, "y": 2e-3}), None, {"g": g, "c": 0.5} | sized, by={"max_step": 0.01},
+    )  # fmt: skip
+
+
 def pushed_arm(friction):
     """Times and the push: nothing for three seconds, then one that comes and goes; rates with this friction."""
     time = 0.01 * np.arange(1200)
@@ -614,6 +623,24 @@ CASES = {
     "an input that acts three and a half samples late": held(0.35),
     "an input that acts at once": held(0.0),
     "a ball that falls from rest": fallen(9.81, 0.02),
+    # what acts against one component depends on the whole velocity
+    "the drag of a thrown ball": resisted("0.05*sqrt(v**2 + w**2)", 9.81, {"quadratic_v_w.c": 0.05}),
+    "friction of a puck until it rests": resisted("4/sqrt(v**2 + w**2 + 1e-8)", 0.0, {"coulomb_v_w.c": 4.0}),
+    "a pendulum over a turning floor": case(
+        ({"x": "v", "y": "w", "v": "-k*x", "w": "-k*y"}, {"k": 3.9}),
+        ({"x": "v", "y": "w", "v": "0.1*w - 4*x", "w": "-0.1*v - 4*y"}, [0.5, 0.0, 0.0, 0.1]),
+        (0.1 * np.arange(600), {"x": 1e-3, "y": 1e-3}), None, {"k": 4.0, "across_v_w.a": 0.1},
+    ),
+    "a spring between two pendulums": case(
+        ({"x": "v", "y": "w", "v": "-k*sin(x)", "w": "-l*sin(y)"}, {"k": 9.2, "l": 9.7}),
+        ({"x": "v", "y": "w", "v": "0.3*(y - x) - 9*sin(x)", "w": "0.5*(x - y) - 9.5*sin(y)"}, [0.5, 0.0, 0.0, 0.1]),
+        (0.1 * np.arange(600), {"x": 1e-3, "y": 1e-3}), None, {"k": 9.0, "coupling_x_y.a": 0.3, "coupling_x_y.b": 0.5},
+    ),
+    "heat from a body to another one": case(
+        ({"x": "-k*x", "y": "-l*y"}, {"k": 0.1, "l": 0.1}),
+        ({"x": "0.05*(y - x) - 0.1*x", "y": "0.1*(x - y) - 0.08*y"}, [80.0, 5.0]),
+        (0.2 * np.arange(300), {"x": 0.05, "y": 0.05}), None, {"coupling_x_y.a": 0.05, "coupling_x_y.b": 0.1},
+    ),
     # of unequal mass: what the play takes from one is missing on the other, too
     "play between two parts": case(
         ({"x": "v", "y": "w", "v": "u - b*v - k*(x - y) - s*x", "w": "k*(x - y)/m - c*w"},

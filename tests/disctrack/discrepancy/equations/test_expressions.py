@@ -156,6 +156,8 @@ def test_what_is_usual_follows_from_the_structure():
     of_motion = {t.name for t in terms.usual(Equations({"x": "v", "v": "-k*x"}, {"k": 1.0}))}
     assert {"coulomb_v", "quadratic_v", "spring_x"} <= of_motion
     assert not any(name.startswith("overflow") for name in of_motion)
+    of_two = Equations({"x": "v", "v": "-k*x", "q": "w", "w": "-k*q"}, {"k": 1.0}, units={"x": "m", "q": "rad"})
+    assert not {"coupling_x_q", "across_v_w", "quadratic_v_w"} & {t.name for t in terms.usual(of_two)}
 
 
 @pytest.mark.statistical
