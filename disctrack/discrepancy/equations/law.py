@@ -1,7 +1,8 @@
 """An unknown force learned from the residuals: a function of one or two states or inputs, or of time.
 
 The function is a Gaussian process in a reduced-rank basis: a line, cosines over the range of the motion, and for
-velocities a jump at rest, each amplitude with a prior sigma that falls with its wave number (Solin & Sarkka 2020).
+velocities a jump at rest, each amplitude with a prior sigma that falls with its wave number (Solin & Sarkka 2020). Of
+an angle that goes round, it is periodic.
 Amplitude and smoothness maximise the marginal likelihood (MacKay 1992), which also selects the equation and the
 variables. Two variables are tried where one is not enough. The law is a term like any other, with exact derivatives.
 Where the declared equations are far from the data, it is learned by multiple shooting.
@@ -53,6 +54,7 @@ WORTH = 50.0  # of first-order -2 log evidence over the best law, up to which a 
 ROUGHLY = 4.0  # ... over this multiple of the best, where the declared equations are far from the data
 PLAUSIBLE = 4.0  # of -2 log evidence: a rougher prior may be less probable by so much
 POINTS = (61, 400)  # of the reported course, for one and two variables
+TURNS = {"rad": 2 * np.pi, "deg": 360.0}  # a turn, by the unit of an angle
 
 
 @dataclass(frozen=True)
@@ -62,11 +64,18 @@ class Along:
     equation: str  # state of the equation
     variables: tuple[str, ...]  # one or two states or inputs; or "t" alone
     jumps: bool = False  # with the sign of the variable, as friction does
+    period: float = 0.0  # of an angle that goes round
 
     @property
     def title(self) -> str:
         """In words."""
-        return f"a force on {self.equation} that is a function of {'time' if self.of_time else self.variable}"
+        of = f"{'time' if self.of_time else self.variable}{', the same in every turn' if self.period else ''}"
+        return f"a force on {self.equation} that is a function of {of}"
+
+    @property
+    def basis(self) -> str:
+        """Initials of its basis functions."""
+        return "ab" if self.period else "asj" if self.jumps else "as"
 
     @property
     def variable(self) -> str:
@@ -120,7 +129,8 @@ class LearnedForce(Explanation):
         """Places (k, 1 or 2); the force (k,) there, in addition to the declared equations; and its sigma (k,)."""
         law, fitted, own = self.along, self.fit, self.candidate.quantities
         visited, k = _visited(self.system, law.variables, fitted.values), len(law.variables) - 1
-        at = np.linspace(visited.min(axis=0), visited.max(axis=0), POINTS[0])
+        ends = (0.0, law.period) if law.period else (float(visited.min()), float(visited.max()))
+        at = np.linspace(ends[0], ends[1], POINTS[0])[:, None]
         if k:
             at = visited[np.linspace(0, len(visited) - 1, POINTS[1]).astype(int)]
         names = [*(q.name for q in own), *self.held]
@@ -162,6 +172,7 @@ class LearnedForce(Explanation):
             "equation": self.along.equation,
             "variable": self.along.variable,
             "jumps_with_its_sign": self.along.jumps,
+            "period": self.along.period or None,
             "beyond": list(self.held),
             "beside": [c.name for c in self.known],
             "at": self.variable,
@@ -175,11 +186,13 @@ class LearnedForce(Explanation):
         }
 
     def text(self, units: Mapping[str, str]) -> str:
-        """Its course at five places: over the range of one variable, or from the smallest to the largest force."""
-        places = self.variable.reshape(len(self.force), -1)
-        order = np.argsort(self.force) if places.shape[1] > 1 else np.arange(len(places))
-        points = []
-        for i in order[np.linspace(0, len(order) - 1, 5).round().astype(int)]:
+        """Its course at both ends, in the middle, and at its extremes; of two variables at quantiles of the force."""
+        places, last = self.variable.reshape(len(self.force), -1), len(self.force) - 1
+        order, points = np.argsort(self.force), []
+        shown = order[np.linspace(0, last, 5).round().astype(int)]
+        if places.shape[1] == 1:
+            shown = np.unique([0, last // 2, last, order[0], order[-1]])
+        for i in shown:
             place = zip(places[i], self.along.units(units), strict=True)
             where = ", ".join(f"{x:.3g} {unit if unit != '1' else ''}".rstrip() for x, unit in place)
             points.append(f"{self.force[i]:.3g}({self.sigma[i]:.2g}) at {where}")
@@ -201,12 +214,13 @@ def learn(
         return None
     if len(system.stretches) * len(system.formulas.states) > MOST_STATES:  # too many initial states to fit
         return None
-    one, law, reportable = _Competition(1, _knowing(system, channels, 1), diagnosis, judged), None, False
+    begin = diagnosis.before.values
+    one, law, reportable = _Competition(1, _knowing(system, channels, 1, begin), diagnosis, judged), None, False
     several = diagnosis.verdict == "unexplained" or len(diagnosis.found) > 2
     for variables, with_known in ((1, False), (1, True), (2, False))[: 3 if several else 1]:
         if law is not None and reportable and law.at_noise:
             break
-        over = one if variables == 1 else _Competition(2, _knowing(system, channels, 2), diagnosis, judged)
+        over = one if variables == 1 else _Competition(2, _knowing(system, channels, 2, begin), diagnosis, judged)
         for known in [(c,) for c in over.known_terms()] if with_known else [()]:
             trial = over.best(known) if system.budget.open() else None
             if trial is not None and (law is None or trial.length < law.length):
@@ -317,7 +331,7 @@ class _Competition:
         near = equivalent([trial for trial in trials if self.has_converged(trial.fit)] or trials)
         # a function of time fits any motion: a function of the state says more, and is tested by every other run
         best = min(near, key=lambda trial: trial.along.of_time)
-        others = (Along(t.along.equation, t.along.variables) for t in near if t.along.title != best.along.title)
+        others = (replace(t.along, jumps=False) for t in near if t.along.title != best.along.title)
         return replace(best, equivalent=tuple(dict.fromkeys(others)))
 
     def _others(self, system: EquationSystem, known: Sequence[Candidate]) -> tuple[Quantity, ...]:
@@ -398,9 +412,17 @@ def _laws(system: EquationSystem, values: Values, n: int) -> Iterator[Along]:
             if many and not there.issuperset(variables):
                 continue
             yield Along(equation, variables)
+            if n == 1 and (period := _period(system, variables[0], values)):
+                yield Along(equation, variables, period=period)
             velocity = n == 1 and variables[0] in {equation, *velocities}
             if velocity and {-1.0, 1.0} <= set(np.sign(_visited(system, variables, values)[:, 0]).tolist()):
                 yield Along(equation, variables, jumps=True)
+
+
+def _period(system: EquationSystem, name: str, values: Values) -> float:
+    """A turn, if it is an angle of which more than that was seen; else 0."""
+    turn = TURNS.get(system.formulas.equations.units.get(name, ""), np.inf)
+    return turn if np.ptp(_visited(system, (name,), values)) > turn else 0.0
 
 
 def _forced(equations: Equations) -> list[str]:
@@ -408,7 +430,7 @@ def _forced(equations: Equations) -> list[str]:
     return [s for s, f in equations.rates.items() if str(f).strip() not in equations.rates]
 
 
-def _knowing(system: EquationSystem, channels: Mapping[str, Formula], n: int) -> EquationSystem:
+def _knowing(system: EquationSystem, channels: Mapping[str, Formula], n: int, values: Values) -> EquationSystem:
     """The system with a law of n variables as a further term; constants select its equation and its variables."""
     f = system.formulas
     e = f.equations
@@ -420,10 +442,13 @@ def _knowing(system: EquationSystem, channels: Mapping[str, Formula], n: int) ->
         words[f"p{i}"] = f"({words[f'x{i}']} - {own}_from)/{own}_span"
         constants |= dict.fromkeys([f"{own}_of_{name}" for name in (*e.states, *e.inputs, "t")] + [f"{own}_from"], 0.0)
         constants[f"{own}_span"] = 1.0
-    course = " + ".join(f"own_{name}*{formula.format(**words)}" for name, (formula, _) in _basis(n).items())
+    # functions that no law has would cost as much as the others
+    turns = n == 1 and any(_period(system, state, values) for state in e.states)
+    basis = {name: formula for name, (formula, _) in _basis(n).items() if turns or not name.startswith("b")}
+    course = " + ".join(f"own_{name}*{formula.format(**words)}" for name, formula in basis.items())
     term = Term(
         NAME, {s: f"{NAME}_on_{s}*({course})" for s in _forced(e)},
-        parameters={name: Parameter(0.0) for name in _basis(n)}, title="a force that no term names",
+        parameters=dict.fromkeys(basis, Parameter(0.0)), title="a force that no term names",
     )  # fmt: skip
     known = Formulas(replace(e, constants={**e.constants, **constants}), (*f.terms, term), channels)
     widths = {known.widths[a].name: system.widths[w.name] for a, w in f.widths.items() if a in known.widths}
@@ -443,7 +468,10 @@ def _basis(n: int) -> dict[str, tuple[str, float]]:
         if (number := float(np.linalg.norm(waves))) <= most:
             found["a" + "_".join(map(str, waves))] = "*".join(cosines) or "1", number
     found |= {f"slope{i or ''}": (f"(2*{{p{i}}} - 1)", 0.0) for i in range(n)}
-    return found if n > 1 else found | {"jump": ("sign({x0})", 0.0)}
+    if n > 1:
+        return found
+    sines = {f"b{k}": (f"sin({k}*pi*{{p0}})", float(k)) for k in range(1, most + 1)}
+    return found | sines | {"jump": ("sign({x0})", 0.0)}
 
 
 def _candidate(law: Along, own: tuple[Quantity, ...]) -> Candidate:
@@ -453,7 +481,7 @@ def _candidate(law: Along, own: tuple[Quantity, ...]) -> Candidate:
 def _amplitudes(system: EquationSystem, law: Along) -> tuple[Quantity, ...]:
     """Amplitudes of the law, without priors."""
     own = (q for c in system.candidates if c.name == NAME for q in c.quantities)
-    return tuple(q for q in own if law.jumps or q.part != "jump")
+    return tuple(q for q in own if q.part[0] in law.basis)
 
 
 def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSystem, dict[str, float]]:
@@ -463,7 +491,10 @@ def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSy
     visited = _visited(system, law.variables, values)
     for i, (variable, x) in enumerate(zip(law.variables, visited.T, strict=True)):
         span = max(float(np.ptp(x)), 1e-12 * max(float(np.abs(x).max()), 1e-12))
-        own = {f"of_{variable}": 1.0, "from": float(x.min()) - MARGIN * span, "span": (1 + 2 * MARGIN) * span}
+        first, length = float(x.min()) - MARGIN * span, (1 + 2 * MARGIN) * span
+        if law.period:
+            first, length = 0.0, law.period / 2
+        own = {f"of_{variable}": 1.0, "from": first, "span": length}
         numbers |= {f"{NAME}_{i}_{n}": x for n, x in own.items()}
     of = f"{NAME}_0_of_"
     mine = [w.name for a, w in system.formulas.widths.items() if any(s.name.startswith(of) for s in a.free_symbols)]

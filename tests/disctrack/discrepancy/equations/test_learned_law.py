@@ -71,6 +71,24 @@ def test_a_law_of_one_variable_is_learned(name):
         assert answer.after["x"].rms == pytest.approx(SIGMA, rel=0.1)
 
 
+def test_a_law_of_an_angle_that_goes_round_is_the_same_in_every_turn(rng):
+    """A dent that brakes a motor once a turn: over ten turns no smooth function of the angle has it."""
+
+    def force(q):
+        return -3 * np.exp((np.cos(q - 1) - 1) / 0.1)
+
+    u = 0.6 + 0.3 * np.sin(0.9 * TIME)
+    rates = lambda t, y: [y[1], 20 * (0.6 + 0.3 * np.sin(0.9 * t)) - 2 * y[1] + force(y[0])]  # noqa: E731
+    turned = solve_ivp(rates, (0, TIME[-1]), [0.3, 5.0], t_eval=TIME, rtol=1e-9, atol=1e-11).y[0]
+    motor = Equations({"q": "w", "w": "g*u - c*w"}, {"g": 18.0, "c": 1.8}, inputs=["u"], units={"q": "rad"})
+    run = Run(TIME, {"q": turned + 1e-3 * rng.standard_normal(len(TIME))}, inputs={"u": u}, sigma=1e-3)
+    answer = diagnose(motor, run)
+    law = answer.law
+    assert (answer.found, law.along.variable, law.along.period) == ((NAME,), "q", 2 * np.pi)
+    assert np.mean(np.abs(law.force - force(law.variable)) < 3 * law.sigma) > 0.9
+    assert f"{law.force.min():.3g}(" in answer.sentence  # its extremes are told
+
+
 def test_a_sample_long_before_all_others_tells_no_turn(rng):
     time = np.append(0.0, 2.0 + 0.05 * np.arange(300))
     swing = solve_ivp(
