@@ -289,15 +289,17 @@ class _Competition:
     def is_reportable(self, law: LearnedForce) -> bool:
         """Does the law predict held-out data, and leave noise, or nearly all of the excess chi-square explained?
 
-        If its residuals are not noise, it also has to be shorter than known terms, and to predict better.
+        Better by its values, and not only by an uncertainty that allows for anything. If its residuals are not noise,
+        it also has to be shorter than known terms, and to predict better than these.
         """
         d = self.diagnosis
         if not self.has_converged(law.fit) or d.held_out_before is None:
             return False
-        if not law.held_out.gain_over(d.held_out_before, self.noise) > CLASS_GAIN:
+        gain, error = law.held_out.gain_over(d.held_out_before, self.noise), law.held_out.chi_square
+        if not (gain > CLASS_GAIN and error < d.held_out_before.chi_square):
             return False
         most = d.settings.unexplained_share * d.before.excess(self.noise)
-        predicts = d.held_out_after is None or law.held_out.chi_square < d.held_out_after.chi_square
+        predicts = d.held_out_after is None or error < d.held_out_after.chi_square
         return law.at_noise or (law.is_shorter and predicts and law.fit.excess(self.noise) < most)
 
     def best(self, known: tuple[Candidate, ...]) -> LearnedForce | None:
