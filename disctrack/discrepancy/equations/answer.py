@@ -179,10 +179,8 @@ class Answer:
 
     def _outlier_notes(self) -> list[str]:
         """Odd runs, and single outliers, which make noise and sigmas too large."""
-        notes = self._odd_run_notes()
-        if self.verdict == "unexplained":
-            return notes
-        predicted = self.predicted(self.diagnosis.after)
+        notes, d = self._odd_run_notes(), self.diagnosis
+        predicted = self.predicted(d.nearest.fit if d.nearest else d.after)
         for c, channel in enumerate(self.system.formulas.channels):
             left = [np.abs(s.data[:, c] - seen[:, c]) for s, seen in predicted]
             limit = outlier_limit(np.concatenate(left))
@@ -192,7 +190,7 @@ class Answer:
                 lie = "1 lies" if len(off) == 1 else f"{len(off)} lie"
                 notes.append(
                     f"{lie} farther off in {channel} than {OUTLIER:.0f} times the scatter of the others ({some}): "
-                    "where the sensor erred, write NaN, and noise and sigmas fall"
+                    "if the sensor erred there, write NaN; if not, more is missing there"
                 )
         return notes
 
