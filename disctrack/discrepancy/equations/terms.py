@@ -113,9 +113,9 @@ def cubic_spring(v: str, x: str, name: str = "") -> Term:
 
 def end_stop(v: str, x: str, side: int = 1, name: str = "") -> Term:
     """A spring that acts beyond a fitted place: a stop, a bumper.   side : -1 for a lower limit of x"""
-    place = Parameter(0.0, shape=True, along=x)
-    formula = f"-{side}*own_k*Max({side}*(({x}) - own_place), 0)"
-    return _on(v, formula, name or f"stop_{x}", f"stop on {x}", k=_POSITIVE, place=place)
+    place, below = Parameter(0.0, shape=True, along=x), "" if side > 0 else "below_"
+    formula, title = f"-{side}*own_k*Max({side}*(({x}) - own_place), 0)", f"stop {'below' if below else 'on'} {x}"
+    return _on(v, formula, name or f"stop_{below}{x}", title, k=_POSITIVE, place=place)
 
 
 def backlash(v: str, x: str, stiffness: str, onto: Mapping[str, str] | None = None, name: str = "") -> Term:
@@ -263,6 +263,7 @@ def usual(equations: Equations) -> tuple[Term, ...]:
         found += [coupling(pairs.get(x, x), x, pairs.get(y, y), y) for x, y in combinations(several, 2)]
     for x, v in pairs.items():
         found += [spring(v, x), asymmetric_spring(v, x), cubic_spring(v, x), deflected(v, x)]
+        found += [end_stop(v, x), end_stop(v, x, -1)]
     observed = equations.observed if equations.observed is not None else {}
     for channel, formula in observed.items():
         found += [sensor_offset(channel), sensor_drift(channel), sensor_curvature(channel, str(formula))]
