@@ -65,6 +65,11 @@ def find_missing(
     if not np.isfinite(diagnosis.before.chi_square):
         raise AnalysisError(_failure(system, diagnosis.before.values))
     diagnosis, autocorrelated, on_noise = _prewhiten(system, diagnosis, settings)
+    # over less than a period initial states explain nearly any motion
+    short = len(system.stretches) > len(given) and shooting.longest_duration(system) < shooting.shortest_period(whole)
+    if diagnosis.verdict == "nothing missing" and short:
+        reason = "the model follows less than a period of the motion, and has no term with which it follows more"
+        diagnosis, notes = replace(diagnosis, verdict="unexplained", reason=reason), [*notes, reason]
     judged = diagnosis.judged or system
     law = learn(system, diagnosis, channels, None if judged is system else judged)
     named = law is not None and law.is_named(diagnosis)

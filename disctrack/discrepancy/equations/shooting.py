@@ -101,6 +101,11 @@ def longest_stretches(system: EquationSystem) -> list[Samples]:
     return [s for s in system.stretches if 2 * len(s.time) >= most]
 
 
+def shortest_period(system: EquationSystem) -> float:
+    """Of the longest stretches."""
+    return min(period(s) for s in longest_stretches(system))
+
+
 def initial_guess(system: EquationSystem) -> tuple[dict[str, float], Array]:
     """Initial states of every stretch by name, estimated from the data, and the sizes (n,) of the states."""
     f = system.formulas
@@ -179,7 +184,7 @@ def levels(system: EquationSystem) -> list[EquationSystem]:
     """
     most, long = MOST_STATES / len(system.formulas.states), longest_stretches(system)
     spacing = min(float(np.median(np.diff(s.time))) for s in long)
-    duration = max(SHORT * min(period(s) for s in long), FEWEST * spacing)
+    duration = max(SHORT * shortest_period(system), FEWEST * spacing)
     levels: list[list[Samples]] = []
     while not levels or len(levels[-1]) > len(system.stretches):
         levels.append([part for s in system.stretches for part in cut(s, duration)])
@@ -193,7 +198,7 @@ def fitted_start(system: EquationSystem, values: Values) -> Start:
     """Fit short stretches, and longer and longer ones, until these are whole or the model no longer follows them."""
     found = _fit_over_levels(levels(system), values)
     followed = longest_duration(found.system) if found.followed else 0.0
-    if found.whole or followed > min(period(s) for s in longest_stretches(system)):
+    if found.whole or followed > shortest_period(system):
         return found
     # over less than a period the initial states explain nearly any motion, and all of it where some are not observed
     at_once = trust_region(system, [with_weak_prior(q) for q in system.base], initial_guess(system)[0] | dict(values))

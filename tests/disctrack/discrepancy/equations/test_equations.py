@@ -466,6 +466,14 @@ def ending(friction, **sized):
     )  # fmt: skip
 
 
+def bumped(past, **sized):
+    return case(
+        ({"x": "v", "v": "-k*x - c*v"}, {"k": 132.0, "c": 0.24}),
+        ({"x": "v", "v": f"-144*x - 0.3*v - 3000*{past}"}, [1.0, 0.0]),
+        (0.01 * np.arange(900), {"x": 2e-3}), None, {"k": 144, "c": 0.3} | sized, by={"max_step": 2e-3},
+    )  # fmt: skip
+
+
 def resisted(by, g, sized):
     """In a plane, with viscous friction too; the force against the velocity is this factor times the velocity."""
     return case(
@@ -626,6 +634,7 @@ CASES = {
     # what acts against one component depends on the whole velocity
     "the drag of a thrown ball": resisted("0.05*sqrt(v**2 + w**2)", 9.81, {"quadratic_v_w.c": 0.05}),
     "friction of a puck until it rests": resisted("4/sqrt(v**2 + w**2 + 1e-8)", 0.0, {"coulomb_v_w.c": 4.0}),
+    "a bumper that nobody offered": bumped("Max(x - 0.5, 0)", **{"stop_x.k": 3000, "stop_x.place": 0.5}),
     "a pendulum over a turning floor": case(
         ({"x": "v", "y": "w", "v": "-k*x", "w": "-k*y"}, {"k": 3.9}),
         ({"x": "v", "y": "w", "v": "0.1*w - 4*x", "w": "-0.1*v - 4*y"}, [0.5, 0.0, 0.0, 0.1]),
@@ -652,6 +661,14 @@ CASES = {
         sigma=5e-4, by={"max_step": 0.005},
     ),
 }  # fmt: skip
+
+
+@pytest.mark.statistical
+def test_stretches_shorter_than_a_period_do_not_show_that_nothing_is_missing(rng):
+    """No longer ones are followed, and hardly one of these has the contact with a bumper below in it."""
+    answer = bumped("Min(x + 0.5, 0)")[0](rng)
+    assert (answer.verdict, answer.found) == ("unexplained", ())
+    assert "less than a period" in " ".join(answer.notes)
 
 
 @pytest.mark.statistical
