@@ -19,9 +19,9 @@ _COLOURS = {"refusal": "31;1", "doubt": "31;1", "warning": "33", "verdict": "1"}
 
 def short(report: Report, width: int = WIDTH, *, colour: bool = False) -> list[str]:
     """Doubts, verdict, accuracy, other findings, page and next command, in at most MOST_LINES."""
-    first = _cut(_entry("verdict", report.verdict, width)) + _cut(_entry("accuracy", report.accuracy, width), 2)
+    first = _entry("verdict", report.verdict, width, _MOST_OF_ONE) + _entry("accuracy", report.accuracy, width, 2)
     last = _entry("page", "" if report.page is None else str(report.page), width) + _entry("next", report.then, width)
-    entries = [_cut(_entry(finding.grave, finding.sentence, width)) for finding in report.graver_first()]
+    entries = [_entry(finding.grave, finding.sentence, width, _MOST_OF_ONE) for finding in report.graver_first()]
     room = MOST_LINES - len(first) - len(last)
     while sum(map(len, entries)) > room - (len(entries) < len(report.findings)) and len(entries) > 1:
         entries.pop()
@@ -57,27 +57,22 @@ def show(report: Report, *, verbose: bool = False) -> None:
     print("\n".join(lines), flush=True)
 
 
-def _cut(lines: list[str], most: int = _MOST_OF_ONE) -> list[str]:
-    """At most so many lines; an ellipsis marks omitted ones."""
-    return lines if len(lines) <= most else [*lines[: most - 1], f"{lines[most - 1].rpartition(' ')[0]} …"]
-
-
 def _coloured(line: str) -> str:
     head = line[:_HEAD].rstrip()
     return f"\x1b[{_COLOURS[head]}m{head}\x1b[0m{line[len(head) :]}" if head in _COLOURS else line
 
 
-def _entry(head: str, said: str, width: int) -> list[str]:
-    """A heading with its text, wrapped to its right; empty without text."""
+def _entry(head: str, said: str, width: int, most: int | None = None) -> list[str]:
+    """A heading with its text, wrapped to its right; empty without text.   most : lines, the last with an ellipsis"""
     if not said or isinstance(said, Markup):
         return []
-    return _wrapped(said, max(width, 40), f"{head:<{_HEAD}} ", " " * (_HEAD + 1))
+    return _wrapped(said, max(width, 40), f"{head:<{_HEAD}} ", " " * (_HEAD + 1), most)
 
 
-def _wrapped(said: str, width: int, first: str = "", then: str = "") -> list[str]:
+def _wrapped(said: str, width: int, first: str = "", then: str = "", most: int | None = None) -> list[str]:
     return textwrap.wrap(
         printable(said), width, initial_indent=first, subsequent_indent=then, break_long_words=False,
-        break_on_hyphens=False,
+        break_on_hyphens=False, max_lines=most, placeholder=" …",
     )  # fmt: skip
 
 

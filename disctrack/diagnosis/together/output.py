@@ -22,7 +22,6 @@ from disctrack.numbers import Measured, in_unit, measured, probability, rounded
 from disctrack.report.blocks import Drawn, Facts, Figures, Listing, Report, Section
 from disctrack.report.palette import AMBER, BLUE, MUTED
 
-NAMED = 8  # recordings that are named on an axis; more are numbered
 MANY = (
     "Standard deviation of an effect's size from the given number of recordings, marginalised over initial states, "
     "laws, calibration and dots. It falls with the square root of the number, down to the limit by the calibration or "
@@ -198,7 +197,7 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
 
     sharing, after = answer.system.sharing, answer.diagnosis.after
     used = [r for r in answer.recordings if not r.reason]
-    drawn = []
+    names, drawn = {float(i): r.name for i, r in enumerate(used)}, []
     for number, q in enumerate(_free(answer.diagnosis), start=1):
         points = []
         for i, a in enumerate(r.alone for r in used):
@@ -213,11 +212,8 @@ def figures(answer: TogetherDiagnosis) -> tuple[Drawn, ...]:
         axes.axhspan(value - 2 * sigma, value + 2 * sigma, color=AMBER, alpha=0.35, lw=0)
         axes.axhline(value, color=AMBER, lw=1)
         axes.errorbar(x, y, s, fmt="o", ms=3, lw=1, color=BLUE, ecolor=MUTED)
-        if len(used) <= NAMED:
-            axes.set_xticks(x, [used[i].name for i in x])
-        else:
-            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-            axes.set_xlabel("recording, from 0")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.xaxis.set_major_formatter(lambda i, _: names.get(i, ""))
         axes.set_ylabel(in_unit(q.stem.removeprefix(f"{q.owner}."), q.unit))
         caption = "Each recording alone, ± 1 σ; the band is ± 2 σ of all together."
         drawn.append(Drawn(f"{number:02d}_{q.name.replace('.', '_').split('[')[0]}", q.name, caption, figure))
