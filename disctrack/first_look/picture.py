@@ -1,5 +1,6 @@
 """The picture of a check: the table view with the axes it defines, and frames with the fitted disc."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +24,11 @@ def check_figure(seen: Check) -> Figure | None:
     frames = [
         (f"frame {trajectory.frame[row]}", draw_pair(images, trajectory, row)[..., ::-1])
         for trajectory, row, images in seen.shown
-    ] or [("disc not found", np.hstack([*images])) for images in seen.raw[:1]]
+    ] or [("disc not found", _beside(images)) for images in seen.raw[:1]]
     shown = [(f"{what}: fitted rim, dots and contact; {' | '.join(CAMERAS)}", picture) for what, picture in frames]
     found = seen.calibration
     table = [] if found is None else _table_view(found)
-    shown = [(TABLE, np.hstack(table)), *shown] if table else shown
+    shown = [(TABLE, _beside(table)), *shown] if table else shown
     if not shown:
         return None
     figure = Figure(figsize=(9.5, 4.6 * len(shown)), layout="constrained")
@@ -41,12 +42,16 @@ def check_figure(seen: Check) -> Figure | None:
     return figure
 
 
+def _beside(images: Iterable[NDArray]) -> NDArray:
+    """The images side by side, each up to its own brightest pixel: a dim one is seen as well."""
+    return np.hstack([image / np.float32(max(image.max(), 1)) for image in images])
+
+
 def _table_view(found: StereoCalibration) -> list[NDArray]:
     """Its images, left and right; none without such a view, or where they are not files."""
     names = () if found.table_view is None else found.view_names[found.table_view]
-    if not all(Path(name).is_file() for name in names):
-        return []
-    return [luminance(decode(Path(name).read_bytes(), name))[0] for name in names]
+    images = (luminance(decode(Path(name).read_bytes(), name))[0] for name in names)
+    return [*images] if all(Path(name).is_file() for name in names) else []
 
 
 def _draw_axes(axes: Axes, found: StereoCalibration) -> None:

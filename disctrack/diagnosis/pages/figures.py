@@ -156,9 +156,8 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     axes.set_xscale("log")
     axes.axvline(threshold(result.system, diagnosis.settings, 1), color=RED, lw=1)
     plain_powers(axes.xaxis)
-    axes.set_xlabel(
-        "decrease of chi-square when it is added to the model (red line: what noise alone can reach with one number)"
-    )
+    line = "red line: what noise alone can reach with one number"
+    axes.set_xlabel(f"decrease of chi-square when it is added to the model\n({line})")
     caption = "The candidates that explain most. Blue: found; amber: indistinguishable alternatives."
     return Drawn("candidates", "What was tried", caption, figure)
 
