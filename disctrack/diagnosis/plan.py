@@ -15,14 +15,14 @@ import numpy as np
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.motion import state_of
+from disctrack.diagnosis.motion import state_of, state_quantities
 from disctrack.diagnosis.stretch import MIN_FRAMES, MIN_THETA
 from disctrack.discrepancy.fit import Fit
-from disctrack.discrepancy.joint.sharing import LAWS, Reduction
+from disctrack.discrepancy.joint.sharing import Member, Reduced, Reduction, Sharing
 from disctrack.discrepancy.joint.together import Bound
 from disctrack.discrepancy.score import Score, cleared, sigmas, span
 from disctrack.discrepancy.search import Diagnosis
-from disctrack.discrepancy.system import Candidate, Quantity, Values
+from disctrack.discrepancy.system import Candidate, Values
 from disctrack.errors import AnalysisError, DiscTrackError
 from disctrack.frames import rotation_from_euler
 from disctrack.rolling import simulate, steady_precession
@@ -94,174 +94,162 @@ class Plan:
         return max(known, key=lambda r: more * r.answers[i], default=None)
 
 
-# Information on quantities, all others marginalised: names (k,), and rows (m, k) whose R^T R is the Fisher information
-Information = tuple[Sequence[str], Array]
-
-
 class Planner:
-    """Information of this recording on laws, cameras and dots, and with that of further recordings."""
+    """Information of recordings, and with that of a further one, which is one more member of their joint system."""
 
     def __init__(
         self,
-        system: DiscSystem,
-        fit: Fit,
+        members: Sequence[Member],
+        like: int,
+        candidates: Iterable[str],
         questions: Sequence[Question],
         noise: float = 1.0,
-        information: Information | None = None,
     ) -> None:
-        """Fit : of the enlarged model.   questions : that `answer` is called with.
+        """Like : which of the members has the surface, the cameras and, unless it is another, the disc of further ones.
 
+        candidates : names of those that are fitted or in question
+        questions : that `answer` is called with, of candidates of this member
         noise : variance of the dots over that stated
-        information : present information; by default that of this recording
         """
-        self.system, self.fit, self._noise = system, fit, noise
-        new = {q.name: q for question in questions for c in question for q in c.quantities}
-        self.tested = tuple(new.values())
-        fitted = [q for q in fit.quantities if not q.is_initial and q.name not in new]
-        self._shared = [q for q in fitted if q.belongs_to]
-        names = [q.name for q in (*self._shared, *self.tested)]
-        spread = [q.prior_sigma for q in self._shared] + [np.inf] * len(self.tested)
-        self._priors = np.diag(1.0 / np.array(spread))
-        self.column = {name: j for j, name in enumerate(names)}
-        self._base = [j for j, name in enumerate(names) if name not in new]
-        if information is None:
-            kept = [q for q in fit.quantities if q.name not in new]
-            self.now = self._information(system, fit.values, [*kept, *self.tested])
-        else:
-            self.now = self._placed(*information)
+        self.questions, self._noise, self._number = tuple(questions), noise, len(members)
+        further = replace(members[like], labels={**members[like].labels, "recording": "further"})
+        another = replace(further, labels={**further.labels, "disc": "another"})
+        self.sharing = Sharing([*members, further, another])
+        variants = {c.name: c for c in self.sharing.candidates}
+        quantities = self.sharing.base | {q.name: q for name in candidates for q in variants[name].quantities}
+        self._names, parts = tuple(quantities), reversed(self.sharing.local[like].items())
+        self._priors = np.diag([1.0 / q.prior_sigma for q in quantities.values()])
+        # of a sum of shared quantities the first one is kept
+        self._column = {local: self._names.index(shared) for shared, local in parts if shared in quantities}
+        tested = {self._column[n] for question in questions for c in question for n in c.names}
+        self._others = [j for j in range(len(self._names)) if j not in tested]
+        self.now = np.zeros((0, len(self._names)))
 
-    def with_(self, proposal: Proposal) -> tuple[Array, float] | None:
-        """Rows of this recording and of the proposed one, and the latter's duration; None if it is impossible."""
+    def names(self, i: int) -> tuple[str, ...]:
+        """Quantities of member i to which the shared ones contribute."""
+        return self.sharing.local_names(i, self._names)
+
+    def know(self, problems: Sequence[Reduced | None]) -> None:
+        """Present information: each recording's problem in its `names`. Raises AnalysisError if one has none."""
+        self.now = np.concatenate([self._rows(i, problem) for i, problem in enumerate(problems)])
+
+    def with_(self, proposal: Proposal, system: DiscSystem, values: Values) -> tuple[Array, float] | None:
+        """Rows of all recordings and of the proposed one, and the latter's duration; None if it is impossible.
+
+        system, values : of the member that it is like
+        """
+        i = self._number + (proposal.mass != 1.0 or proposal.radius != 1.0)
         try:
-            planned, values = self._planned(proposal)
-            possible = {name for c in planned.candidates for name in c.names}
-            found = [q for q in self._shared if q.name in possible]
-            quantities = {q.name: q for q in (*planned.base, *found, *self.tested)}
-            another = proposal.mass != 1.0 or proposal.radius != 1.0
-            rows = self._information(planned, values, quantities.values(), another)
+            planned, at = planned_recording(proposal, system, values)
+            own = self.sharing.own(i, planned.base)
+            rows = self._rows(i, Reduction(planned, own, at).reduce(at, self.names(i)))
         except DiscTrackError:  # there is no such precession, or it ends at once
             return None
         return np.concatenate([self.now, rows]), float(planned.time[-1] - planned.time[0])
 
-    def answer(self, rows: Array, question: Question) -> float:
+    def answer(self, rows: Array, question: Question, values: Values) -> float:
         """Distance [sigmas] of the effect at its fitted size from all that the alternative can predict.
 
         Without an alternative the standard deviation of the effect's first quantity; infinite if not determined.
         """
         matrix = np.concatenate([rows, self._priors])
-        columns, *alternative = (matrix[:, [self.column[n] for n in c.names]] for c in question)
-        basis = span(np.column_stack([matrix[:, self._base], *alternative]))
+        columns, *alternative = (matrix[:, [self._column[n] for n in c.names]] for c in question)
+        basis = span(np.column_stack([matrix[:, self._others], *alternative]))
         if not alternative:
             return float(sigmas(columns, basis)[0])
-        amounts = np.array([self.fit.values.get(q.name, q.null) - q.null for q in question[0].quantities])
+        amounts = np.array([values.get(q.name, q.null) - q.null for q in question[0].quantities])
         return float(np.linalg.norm(cleared(columns @ amounts, basis)))
 
-    def _information(
-        self, system: DiscSystem, values: Values, quantities: Iterable[Quantity], another: bool = False
-    ) -> Array:
-        """(m, k) rows of a recording on the shared ones among these quantities; its own ones are eliminated.
-
-        another : it is of another disc, which has its own k_m, inertia and dots, as in a joint diagnosis; laws that
-            were found or are in question have one coefficient for both
-        """
-        here, in_base = system is self.system, {q.name for q in system.base}
-        own, shared = list[Quantity](), list[Quantity]()
-        for q in quantities:
-            one_for_all = q.name not in in_base and any(kind in LAWS for kind in q.belongs_to)
-            its_own = not q.belongs_to or (another and "disc" in q.belongs_to and not one_for_all)
-            (own if its_own and not (here and q in self.tested) else shared).append(q)
-        names = [q.name for q in shared]
-        start = {q.name: q.null for q in own} | dict(values)
-        reduced = Reduction(system, own, start).reduce(start, names)
-        if reduced is None:
+    def _rows(self, i: int, reduced: Reduced | None) -> Array:
+        """(m, k) derivatives by the shared quantities, in units of the noise."""
+        if not isinstance(reduced, tuple):
             raise AnalysisError("the motion cannot be followed")
-        return np.asarray(triangle(self._placed(names, reduced[1])) / np.sqrt(self._noise), float)
-
-    def _placed(self, names: Sequence[str], rows: Array) -> Array:
-        """Rows (m, k) of these quantities, in the planner's columns; others are left out."""
-        placed = np.zeros((len(rows), len(self.column)))
-        for j, name in enumerate(names):
-            if name in self.column:
-                placed[:, self.column[name]] = rows[:, j]
-        return placed
-
-    def _planned(self, proposal: Proposal) -> tuple[DiscSystem, dict[str, float]]:
-        """The system of the proposed recording, with the same cameras and noise, and the values of its quantities.
-
-        Raises DiscTrackError if its motion is too short.
-        """
-        system, old = self.system, self.system.trajectory
-        disc = replace(  # of another material, or larger of the same thickness, with larger distances of the dots
-            system.disc,
-            mass=system.disc.mass * proposal.mass * proposal.radius**2,
-            radius=system.disc.radius * proposal.radius,
-            marker_centres_body=system.disc.marker_centres_body * [proposal.radius, proposal.radius, 1.0],
-        )
-        changed: dict[str, Any] = {"disc": disc, "air_density": old.air_density * proposal.pressure}
-        values = {k: v for k, v in self.fit.values.items() if not k.startswith(("state.", "rig.", "dot_"))}
-        start = state_of(self.fit.values)
-        if proposal.theta_deg is not None:
-            start = steady_precession(
-                np.radians(proposal.theta_deg),
-                disc,
-                system.model.gravity,
-                omega3=proposal.omega3,
-                nutation_amplitude=np.radians(NUTATION_SHARE * proposal.theta_deg),
-            ).moved(**dict(zip("xy", np.nanmean(old.q[:, :2], axis=0).tolist(), strict=True)))
-        duration, rate = proposal.duration or float(np.ptp(system.time)), old.frame_rate * proposal.rate
-        model = replace(system.model_with(values), **changed)
-        motion = simulate(model, start, duration, rate=rate, theta_end=MIN_THETA)
-        n, m = len(motion), disc.n_markers
-        if n < MIN_FRAMES:
-            raise AnalysisError(f"the motion is over after {n} frames")
-        R = rotation_from_euler(*motion.q[:, 3:].T)
-        pixels = system.rig.project(disc.marker_centres_body @ np.swapaxes(R, 1, 2) + motion.q[:, None, :3])
-        pixels = np.moveaxis(pixels, -3, 1)
-        usual = np.nanmedian(old.markers_covariance_px2.reshape(-1, 2, 2), axis=0) / proposal.numbers
-        seen = np.where(np.isfinite(pixels).all(-1), MarkerStatus.MEASURED, MarkerStatus.OUTSIDE)
-        # other arrays by frame are not used by the system
-        trajectory = replace(
-            part(old, slice(0, 1)),
-            time=motion.time,
-            q=motion.q,
-            markers_px=pixels,
-            markers_covariance_px2=np.broadcast_to(usual, (n, 2, m, 2, 2)),
-            marker_status=seen.astype(np.uint8),
-            frame_rate=rate,
-            **changed,
-        )
-        known = replace(system.model, **changed)
-        planned = DiscSystem(trajectory, known, rows=slice(0, n), systematic=system.systematic)
-        names = [q.name for q in planned.base]
-        state = dict(zip(names[:8], start.array[:8].tolist(), strict=True))
-        return planned, dict.fromkeys(names, 0.0) | values | state
+        return triangle(self.sharing.placed(i, reduced[1], self._names)) / np.sqrt(self._noise)
 
 
-def plan(
-    system: DiscSystem,
-    fit: Fit,
-    questions: Sequence[Question],
-    noise: float = 1.0,
-    information: Information | None = None,
-) -> Plan:
+def planner_alone(system: DiscSystem, fit: Fit, questions: Sequence[Question], noise: float = 1.0) -> Planner:
+    """For further recordings after a single one.   fit : of the enlarged model.   noise : as for `Planner`"""
+    new = {q.name: q for question in questions for c in question for q in c.quantities}
+    in_base, fitted = {q.name for q in system.base}, {q.name: q for q in fit.quantities}
+    base = tuple(q for n, q in fitted.items() if n not in new and (n in in_base or not q.belongs_to))
+    added = [replace(q, belongs_to=q.belongs_to or ("recording",)) for q in (fitted | new).values() if q not in base]
+    candidates = tuple(Candidate(q.name, q.owner, "motion", q.name, "", (q,)) for q in added)
+    member = Member("", base, candidates, fit.values, 0, {})
+    planner = Planner([member], 0, [c.name for c in candidates], questions, noise)
+    own = planner.sharing.own(0, base)
+    planner.know([Reduction(system, own, fit.values).reduce(fit.values, planner.names(0))])
+    return planner
+
+
+def planned_recording(proposal: Proposal, system: DiscSystem, values: Values) -> tuple[DiscSystem, dict[str, float]]:
+    """The system of the proposed recording, with the same cameras and noise, and the values of its quantities.
+
+    Raises DiscTrackError if its motion is too short.
+    """
+    old = system.trajectory
+    disc = replace(  # of another material, or larger of the same thickness, with larger distances of the dots
+        system.disc,
+        mass=system.disc.mass * proposal.mass * proposal.radius**2,
+        radius=system.disc.radius * proposal.radius,
+        marker_centres_body=system.disc.marker_centres_body * [proposal.radius, proposal.radius, 1.0],
+    )
+    changed: dict[str, Any] = {"disc": disc, "air_density": old.air_density * proposal.pressure}
+    kept = {k: v for k, v in values.items() if not k.startswith(("state.", "rig.", "dot_"))}
+    start = state_of(values)
+    if proposal.theta_deg is not None:
+        start = steady_precession(
+            np.radians(proposal.theta_deg),
+            disc,
+            system.model.gravity,
+            omega3=proposal.omega3,
+            nutation_amplitude=np.radians(NUTATION_SHARE * proposal.theta_deg),
+        ).moved(**dict(zip("xy", np.nanmean(old.q[:, :2], axis=0).tolist(), strict=True)))
+    duration, rate = proposal.duration or float(np.ptp(system.time)), old.frame_rate * proposal.rate
+    model = replace(system.model_with(kept), **changed)
+    motion = simulate(model, start, duration, rate=rate, theta_end=MIN_THETA)
+    n, m = len(motion), disc.n_markers
+    if n < MIN_FRAMES:
+        raise AnalysisError(f"the motion is over after {n} frames")
+    R = rotation_from_euler(*motion.q[:, 3:].T)
+    pixels = system.rig.project(disc.marker_centres_body @ np.swapaxes(R, 1, 2) + motion.q[:, None, :3])
+    pixels = np.moveaxis(pixels, -3, 1)
+    usual = np.nanmedian(old.markers_covariance_px2.reshape(-1, 2, 2), axis=0) / proposal.numbers
+    seen = np.where(np.isfinite(pixels).all(-1), MarkerStatus.MEASURED, MarkerStatus.OUTSIDE)
+    # other arrays by frame are not used by the system
+    trajectory = replace(
+        part(old, slice(0, 1)),
+        time=motion.time,
+        q=motion.q,
+        markers_px=pixels,
+        markers_covariance_px2=np.broadcast_to(usual, (n, 2, m, 2, 2)),
+        marker_status=seen.astype(np.uint8),
+        frame_rate=rate,
+        **changed,
+    )
+    known = replace(system.model, **changed)
+    planned = DiscSystem(trajectory, known, rows=slice(0, n), systematic=system.systematic)
+    return planned, kept | {q.name: x for q, x in zip(state_quantities(), start.array[:8].tolist(), strict=True)}
+
+
+def plan(planner: Planner, system: DiscSystem, values: Values) -> Plan:
     """Answers of many possible recordings: first other initial conditions, then changes of the best of them.
 
-    information : as for `Planner`
+    system, values : of the recording that they are like
     """
-    planner = Planner(system, fit, questions, noise, information)
+    questions = planner.questions
 
     def answers(rows: Array) -> tuple[float, ...]:
-        return tuple(planner.answer(rows, question) for question in questions)
+        return tuple(planner.answer(rows, question, values) for question in questions)
 
     now = answers(planner.now)
 
     def made(proposals: Iterable[Proposal]) -> Iterator[Proposed]:
         for proposal in proposals:
-            if (possible := planner.with_(proposal)) is not None:
+            if (possible := planner.with_(proposal, system, values)) is not None:
                 yield Proposed(proposal, possible[1], answers(possible[0]))
 
     again = Proposal()
-    first = Plan(tuple(questions), now, tuple(made((*(Proposal(*start) for start in STARTS), again))))
+    first = Plan(questions, now, tuple(made((*(Proposal(*start) for start in STARTS), again))))
     bases = dict.fromkeys([again, *(b.proposal for i in range(len(questions)) if (b := first.best(i)) is not None)])
     changed = (
         replace(base, **{name: factor})

@@ -26,7 +26,7 @@ from disctrack.diagnosis.model_file import PAPER, declared_model, model_toml
 from disctrack.diagnosis.motion_search import diagnose_motion, with_slip
 from disctrack.diagnosis.pages.output import as_json, write_diagnosis
 from disctrack.diagnosis.pages.report import report_of
-from disctrack.diagnosis.plan import open_questions, plan
+from disctrack.diagnosis.plan import open_questions, plan, planner_alone
 from disctrack.diagnosis.recorded import read_recorded
 from disctrack.diagnosis.supplement import supplement
 from disctrack.discrepancy.fit import Fit
@@ -104,7 +104,8 @@ def with_plan(result: DiscDiagnosis) -> DiscDiagnosis:
     candidates = [c for c in result.system.candidates if c.kind == "motion" and not (c.threshold or c.sought)]
     scores = score_all(Linearisation(result.system, diagnosis.after, candidates), candidates)
     questions = open_questions(diagnosis, scores)
-    return replace(result, plan=plan(result.system, diagnosis.after, questions, diagnosis.noise))
+    planner = planner_alone(result.system, diagnosis.after, questions, diagnosis.noise)
+    return replace(result, plan=plan(planner, result.system, diagnosis.after.values))
 
 
 def _verdict_by_residuals(diagnosis: Diagnosis, tests: ResidualTests) -> Diagnosis:

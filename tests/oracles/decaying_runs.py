@@ -50,8 +50,7 @@ class DecayMember:
         self.member = Member(name, self.system.base, candidates, self.base.values, len(TIME), labels, covariates)
 
     def share(self, own):
-        mine = [q for q in self.system.base if q.name in own]
-        self.reduction = Reduction(self.system, mine, self.base.values)
+        self.reduction = Reduction(self.system, own, self.base.values)
 
     def reduce(self, values, names):
         return self.reduction.reduce(values, names)

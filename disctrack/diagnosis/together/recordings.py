@@ -9,15 +9,15 @@ from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.large_faults import large_faults
 from disctrack.diagnosis.model_file import PAPER, declared_model
-from disctrack.diagnosis.plan import Information, Plan, Question, open_questions, plan
+from disctrack.diagnosis.plan import Plan, Planner, open_questions, plan
 from disctrack.diagnosis.recorded import Recorded, wrong_declarations
 from disctrack.diagnosis.systematic import MAX_FRAMES, Systematic, find_systematic, noise_over_stated, with_noise
-from disctrack.discrepancy.fit import Fit, fit, no_fit
+from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.sharing import Member, Reduced, Reduction
 from disctrack.discrepancy.joint.together import TogetherDiagnosis, answer_together
 from disctrack.discrepancy.noise import inflation
-from disctrack.discrepancy.system import Values
+from disctrack.discrepancy.system import Quantity, Values
 from disctrack.errors import AnalysisError
 from disctrack.files.json_text import json_text
 from disctrack.findings import Kind
@@ -57,25 +57,20 @@ def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
     system, diagnosis = answer.system, answer.diagnosis
     sharing, after = system.sharing, diagnosis.after
     longest = int(np.argmax(system.weights))
-    local = {c.name for c in sharing.members[longest].candidates}
-    questions = open_questions(diagnosis, [b for b in answer.bounds if b.candidate.name in local])
-    questions = tuple(question for question in questions if {c.name for c in question} <= local)
+    local = {c.name: c for c in sharing.members[longest].candidates}
+    asked = open_questions(diagnosis, [b for b in answer.bounds if b.candidate.name in local])
+    questions = [
+        tuple(local[c.name] for c in question) for question in asked if {c.name for c in question} <= local.keys()
+    ]
     if not questions:
         return None
-    tested = [q for question in questions for c in question for q in c.quantities]
-    everything = {q.name: q for q in (*tested, *after.quantities)}
-    parts = reversed(sharing.local[longest].items())  # of a sum of shared quantities the first one is kept
-    names = {there: shared for shared, there in parts if shared in everything}
-    others = [q for n, q in everything.items() if n not in set(names.values())]
-    values = {n: q.null for n, q in everything.items()} | after.values
-    known = Reduction(system, others, values).reduce(values, tuple(names.values()))
-    if known is None:
-        return None
-    information = tuple(names), known[1]
-    extra = sharing.local_names(longest, [n for f in diagnosis.found for n in f.candidate.names])
-    arguments = sharing.local_values(longest, after.values), extra, questions, information
-    (found,) = crew.call("planned", [arguments], [longest])
-    return found if isinstance(found, Plan) else None
+    candidates = [*(f.candidate.name for f in diagnosis.found), *(c.name for question in questions for c in question)]
+    planner = Planner(sharing.members, longest, candidates, questions)
+    crew.call("share", [(planner.sharing.own(i, member.base),) for i, member in enumerate(sharing.members)])
+    values = [sharing.local_values(i, after.values) for i in range(len(sharing.members))]
+    problems = crew.call("reduce", [(at, planner.names(i)) for i, at in enumerate(values)])
+    (further,) = crew.call("planned", [(planner, problems, values[longest])], [longest])
+    return further if isinstance(further, Plan) else None
 
 
 def labels_of(recordings: Sequence[Recorded]) -> list[dict[str, str]]:
@@ -140,10 +135,9 @@ class DiscMember:
             covariates=air | {"mass": disc.mass, "radius": disc.radius, "thickness": 2 * disc.half_thickness},
         )
 
-    def share(self, own: Sequence[str]) -> None:
-        """Declare which quantities are its own; all others of the base are shared."""
-        mine = [q for q in self.system.base if q.name in set(own)]
-        self._reduction = Reduction(self.system, mine, self.base.values)
+    def share(self, own: Sequence[Quantity]) -> None:
+        """Declare which quantities of the base are its own; all others are shared."""
+        self._reduction = Reduction(self.system, own, self.base.values)
 
     def reduce(self, values: Values, names: Sequence[str]) -> Reduced | None:
         """Its information on shared quantities."""
@@ -161,16 +155,10 @@ class DiscMember:
         growth = inflation(system, found)
         return found, replace(found, covariance=found.covariance * np.outer(growth, growth))
 
-    def planned(
-        self, values: Values, names: Sequence[str], questions: Sequence[Question], information: Information
-    ) -> Plan:
-        """Further recordings that would answer questions.   information : of all recordings together
-
-        values : of the shared quantities.   names : of those that are not in the base
-        """
-        known = {q.name: q for c in self.system.candidates for q in c.quantities}
-        quantities = (*self.system.base, *(known[n] for n in names))
-        return plan(self.system, no_fit(quantities, self._everything(values)), questions, information=information)
+    def planned(self, planner: Planner, problems: Sequence[Reduced], values: Values) -> Plan:
+        """Further recordings like this one.   problems : of all, for `know`.   values : of its shared quantities"""
+        planner.know(problems)
+        return plan(planner, self.system, self._everything(values))
 
     def _everything(self, shared: Values) -> dict[str, float]:
         return {**self.base.values, **self._reduction.own_values, **self.system.known, **shared}

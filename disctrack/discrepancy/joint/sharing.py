@@ -45,14 +45,18 @@ class Sharing:
         self.base: dict[str, Quantity] = {}
         self._groups: dict[str, dict[str, str]] = {}  # quantity of a law -> group -> shared name
         self._nulls: dict[str, float] = {}
-        self._own: list[list[Quantity]] = [[] for _ in members]
         # of each member: shared name -> its quantity, whose difference from null is the sum of theirs
         self.local: list[dict[str, str]] = [{} for _ in members]
         for i, member in enumerate(members):
             for q in member.base:
-                self._base_quantity(i, q)
+                if not q.belongs_to or (is_linear(q) and self._alone(member, q)):
+                    continue
+                group = self.group(member, q)
+                shared = self._share(i, q, group)
+                self.base.setdefault(shared.name, shared)
+                if not np.isfinite(q.prior_sigma):
+                    self._groups.setdefault(q.name, {})[group] = shared.name
         self.candidates = self._all_candidates()
-        self.own = tuple(tuple(own) for own in self._own)  # of each member, the base quantities that it does not share
 
     def all_groups(self) -> dict[str, dict[str, str]]:
         """Quantities of laws that differ from group to group: name -> group -> shared name."""
@@ -91,17 +95,6 @@ class Sharing:
     def _alone(self, member: Member, q: Quantity) -> bool:
         own = self.group(member, q)
         return sum(self.group(m, q) == own for m in self.members) == 1
-
-    def _base_quantity(self, i: int, q: Quantity) -> None:
-        member = self.members[i]
-        if not q.belongs_to or (is_linear(q) and self._alone(member, q)):
-            self._own[i].append(q)
-            return
-        group = self.group(member, q)
-        shared = self._share(i, q, group)
-        self.base.setdefault(shared.name, shared)
-        if not np.isfinite(q.prior_sigma):
-            self._groups.setdefault(q.name, {})[group] = shared.name
 
     def _share(self, i: int, local: Quantity, group: str) -> Quantity:
         # shared quantities are not projected out beforehand: rows of the joint system are not rows of data
@@ -145,6 +138,10 @@ class Sharing:
             variants.append(replace(first, name=name, quantities=tuple(new.values()), title=title))
         return variants
 
+    def own(self, i: int, base: Sequence[Quantity]) -> list[Quantity]:
+        """Those of a member's base quantities that it does not share."""
+        return [q for q in base if q.name not in self.local[i].values()]
+
     def local_names(self, i: int, names: Sequence[str]) -> tuple[str, ...]:
         """The member's quantities to which these shared ones contribute."""
         return tuple(dict.fromkeys(self.local[i][name] for name in names if name in self.local[i]))
@@ -158,6 +155,12 @@ class Sharing:
             if away or name in self.base:
                 values[local] = values.get(local, null) + away
         return values
+
+    def placed(self, i: int, matrix: Array, names: Sequence[str]) -> Array:
+        """(m, k) derivatives by shared quantities of a member's rows, from those by its own ones (`local_names`)."""
+        local = [*self.local_names(i, names), None]  # the last column: those that the member does not have
+        with_none = np.column_stack([matrix, np.zeros(len(matrix))])
+        return with_none[:, [local.index(self.local[i].get(name)) for name in names]]
 
     def start(self) -> dict[str, float]:
         """Initial values of the shared base quantities: the median over the recordings fitted alone.
@@ -208,11 +211,13 @@ class JointSystem(System):
     """Recordings that share quantities. A row is the reduced least-squares problem of a recording."""
 
     def __init__(self, sharing: Sharing, crew: Crew) -> None:
-        """Crew : of the members of the sharing, each with a method `reduce` (`Reduction`)."""
+        """Crew : of the members of the sharing, each with the methods `share` and `reduce` (`Reduction`)."""
         self.sharing, self._crew = sharing, crew
         n = len(sharing.members)
         self.time: Array = np.arange(n, dtype=float)
-        free = [sum(not np.isfinite(q.prior_sigma) for q in own) for own in sharing.own]
+        own = [sharing.own(i, m.base) for i, m in enumerate(sharing.members)]
+        crew.call("share", [(quantities,) for quantities in own])
+        free = [sum(not np.isfinite(q.prior_sigma) for q in quantities) for quantities in own]
         self.weights: Array = np.array([m.n_data - k for m, k in zip(sharing.members, free, strict=True)], float)
         self.base: tuple[Quantity, ...] = tuple(sharing.base.values())
         self.candidates: tuple[Candidate, ...] = sharing.candidates
@@ -220,15 +225,13 @@ class JointSystem(System):
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Rows (n, w) of the reduced problems, padded with zeros, and their derivatives (n, w, k)."""
         sharing, n = self.sharing, len(self.time)
-        local = [sharing.local_names(i, names) for i in range(n)]
-        found = self._crew.call("reduce", [(sharing.local_values(i, values), local[i]) for i in range(n)])
+        at = [(sharing.local_values(i, values), sharing.local_names(i, names)) for i in range(n)]
+        found = self._crew.call("reduce", at)
         reduced = {i: each for i, each in enumerate(found) if isinstance(each, tuple)}
         width = max([1, *(len(right) for right, _ in reduced.values())])
         residual, derivative = np.full((n, width), np.nan), np.zeros((n, width, len(names)))
         for i, (right, matrix) in reduced.items():
             residual[i] = 0.0
             residual[i, : len(right)] = right
-            for column, name in enumerate(names):
-                if name in sharing.local[i]:
-                    derivative[i, : len(right), column] = matrix[:, local[i].index(sharing.local[i][name])]
+            derivative[i, : len(right)] = sharing.placed(i, matrix, names)
         return residual, derivative

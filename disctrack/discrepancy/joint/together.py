@@ -143,7 +143,6 @@ def _search(
     members: Sequence[Member], crew: Crew, settings: Settings, progress: Callable[[str], None]
 ) -> tuple[JointSystem, Diagnosis]:
     sharing = Sharing(members)
-    crew.call("share", [([q.name for q in own],) for own in sharing.own])
     system = JointSystem(sharing, crew)
     progress(f"{len(members)} recordings together: {len(system.base)} shared quantities")
     n = len(members)

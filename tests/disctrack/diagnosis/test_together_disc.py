@@ -1,13 +1,12 @@
 """Recordings of the disc diagnosed together, and what a further one would bring."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from disctrack import Provenance, diagnose, write_trajectory
-from disctrack.diagnosis.plan import Planner, Proposal
+from disctrack.diagnosis.plan import Proposal, planner_alone
 from disctrack.diagnosis.recorded import Recorded
 from disctrack.diagnosis.together.recordings import diagnose_together
 from disctrack.synthetic.description import Scene
@@ -107,13 +106,15 @@ def test_a_planned_recording_brings_what_it_brings_when_it_is_made(mass):
     result = diagnose(first)
     system, fit = result.system, result.diagnosis.after
     candidate = next(c for c in system.candidates if c.name == "air_bildsten")
-    planner = Planner(system, fit, [(candidate,)])
-    rows, duration = planner.with_(Proposal(12.0, 2.0, 0.3, mass=mass))
-    disc = replace(first.disc, mass=mass * first.disc.mass)
+    planner = planner_alone(system, fit, [(candidate,)])
+    rows, duration = planner.with_(Proposal(12.0, 2.0, 0.3, mass=mass), system, fit.values)
+    disc = {"mass_g": mass * Scene().disc.mass_g}
     made = measured(seed=2, n=round(duration * RATE) + 1, theta_deg=12.0, nutation_deg=0.6, omega3=2.0,
                     disc=disc, **RIG)  # fmt: skip
     both = diagnose_together([Recorded("first", first), Recorded("second", made)])
     (bound,) = [b for b in both.bounds if b.candidate.name == "air_bildsten"]
-    assert planner.answer(planner.now, (candidate,)) == pytest.approx(float(bound.by_number[1][0]), rel=0.05)
-    assert planner.answer(rows, (candidate,)) == pytest.approx(float(bound.by_number[2][0]), rel=0.1)
+    assert planner.answer(planner.now, (candidate,), fit.values) == pytest.approx(
+        float(bound.by_number[1][0]), rel=0.05
+    )
+    assert planner.answer(rows, (candidate,), fit.values) == pytest.approx(float(bound.by_number[2][0]), rel=0.1)
     assert both.diagnosis.verdict == "nothing missing"

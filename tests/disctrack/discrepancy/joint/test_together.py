@@ -24,7 +24,6 @@ from tests.oracles.decaying_runs import DISC, DecayMember, fitted_at_once, one, 
 def joint(items, processes=1):
     crew = Crew(DecayMember, items, processes)
     sharing = Sharing([DecayMember(item).member for item in items])
-    crew.call("share", [([q.name for q in own],) for own in sharing.own])
     return JointSystem(sharing, crew), crew
 
 
@@ -269,7 +268,7 @@ def test_after_ctrl_c_the_processes_are_gone_without_a_word_of_their_own(tmp_pat
 
 def test_a_run_that_cannot_be_prepared_is_an_error_in_its_place(rng):
     crew = Crew(DecayMember, [*runs(rng, 1), None])
-    good, bad = crew.call("share", [(["state.a", "state.b"],)] * 2)
+    good, bad = crew.call("share", [((),)] * 2)
     assert good is None
     assert isinstance(bad, AnalysisError)
     assert "TypeError" in str(bad)
