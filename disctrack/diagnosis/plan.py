@@ -101,13 +101,14 @@ class Planner:
         self,
         members: Sequence[Member],
         like: int,
-        candidates: Iterable[str],
+        found: Iterable[str],
+        tested: Iterable[str],
         questions: Sequence[Question],
         noise: float = 1.0,
     ) -> None:
         """Like : which of the members has the surface, the cameras and, unless it is another, the disc of further ones.
 
-        candidates : names of those that are fitted or in question
+        found, tested : names of candidates that are fitted in any case, and of those that are in question
         questions : that `answer` is called with, of candidates of this member
         noise : variance of the dots over that stated
         """
@@ -116,13 +117,14 @@ class Planner:
         another = replace(further, labels={**further.labels, "disc": "another"})
         self.sharing = Sharing([*members, further, another])
         variants = {c.name: c for c in self.sharing.candidates}
-        quantities = self.sharing.base | {q.name: q for name in candidates for q in variants[name].quantities}
+        fitted = self.sharing.base | {q.name: q for name in found for q in variants[name].quantities}
+        quantities = {q.name: q for name in tested for q in variants[name].quantities} | fitted
         self._names, parts = tuple(quantities), reversed(self.sharing.local[like].items())
         self._priors = np.diag([1.0 / q.prior_sigma for q in quantities.values()])
         # of a sum of shared quantities the first one is kept
         self._column = {local: self._names.index(shared) for shared, local in parts if shared in quantities}
-        tested = {self._column[n] for question in questions for c in question for n in c.names}
-        self._others = [j for j in range(len(self._names)) if j not in tested]
+        here = self._column.values()
+        self._free = [j for j, name in enumerate(self._names) if name in fitted or j not in here]
         self.now = np.zeros((0, len(self._names)))
 
     def names(self, i: int) -> tuple[str, ...]:
@@ -152,9 +154,11 @@ class Planner:
 
         Without an alternative the standard deviation of the effect's first quantity; infinite if not determined.
         """
-        matrix = np.concatenate([rows, self._priors])
-        columns, *alternative = (matrix[:, [self._column[n] for n in c.names]] for c in question)
-        basis = span(np.column_stack([matrix[:, self._others], *alternative]))
+        tested = [[self._column[n] for n in c.names] for c in question]
+        matrix = np.concatenate([rows, np.delete(self._priors, np.concatenate(tested), axis=0)])
+        columns, *alternative = (matrix[:, each] for each in tested)
+        others = [j for j in self._free if not any(j in each for each in tested)]
+        basis = span(np.column_stack([matrix[:, others], *alternative]))
         if not alternative:
             return float(sigmas(columns, basis)[0])
         amounts = np.array([values.get(q.name, q.null) - q.null for q in question[0].quantities])
@@ -169,13 +173,15 @@ class Planner:
 
 def planner_alone(system: DiscSystem, fit: Fit, questions: Sequence[Question], noise: float = 1.0) -> Planner:
     """For further recordings after a single one.   fit : of the enlarged model.   noise : as for `Planner`"""
-    new = {q.name: q for question in questions for c in question for q in c.quantities}
-    in_base, fitted = {q.name for q in system.base}, {q.name: q for q in fit.quantities}
-    base = tuple(q for n, q in fitted.items() if n not in new and (n in in_base or not q.belongs_to))
-    added = [replace(q, belongs_to=q.belongs_to or ("recording",)) for q in (fitted | new).values() if q not in base]
-    candidates = tuple(Candidate(q.name, q.owner, "motion", q.name, "", (q,)) for q in added)
+    tested = {q.name: q for question in questions for c in question for q in c.quantities}
+    in_base = {q.name for q in system.base}
+    base = tuple(q for q in fit.quantities if q.name in in_base or not (q.belongs_to or q.name in tested))
+    added = {q.name: q for q in (*tested.values(), *fit.quantities) if q not in base and q.name not in in_base}
+    of_one = [replace(q, belongs_to=q.belongs_to or ("recording",)) for q in added.values()]
+    candidates = tuple(Candidate(q.name, q.owner, "motion", q.name, "", (q,)) for q in of_one)
     member = Member("", base, candidates, fit.values, 0, {})
-    planner = Planner([member], 0, [c.name for c in candidates], questions, noise)
+    found, new = [n for n in added if n in fit.names], [n for n in added if n not in fit.names]
+    planner = Planner([member], 0, found, new, questions, noise)
     own = planner.sharing.own(0, base)
     planner.know([Reduction(system, own, fit.values).reduce(fit.values, planner.names(0))])
     return planner

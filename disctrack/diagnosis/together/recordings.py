@@ -64,8 +64,8 @@ def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
     ]
     if not questions:
         return None
-    candidates = [*(f.candidate.name for f in diagnosis.found), *(c.name for question in questions for c in question)]
-    planner = Planner(sharing.members, longest, candidates, questions)
+    found, tested = [f.candidate.name for f in diagnosis.found], [c.name for question in questions for c in question]
+    planner = Planner(sharing.members, longest, found, tested, questions)
     crew.call("share", [(planner.sharing.own(i, member.base),) for i, member in enumerate(sharing.members)])
     values = [sharing.local_values(i, after.values) for i in range(len(sharing.members))]
     problems = crew.call("reduce", [(at, planner.names(i)) for i, at in enumerate(values)])

@@ -11,7 +11,7 @@ from disctrack.diagnosis.recorded import Recorded
 from disctrack.diagnosis.together.recordings import diagnose_together
 from disctrack.synthetic.description import Scene
 from tests.oracles import newton_euler
-from tests.oracles.measured_disc import K_M, assert_sized, measured
+from tests.oracles.measured_disc import K_M, assert_sized, measured, with_base_fit
 
 RATE = 400.0
 RIG = {"declared_rate": RATE, "rig_seed": 5}
@@ -118,3 +118,13 @@ def test_a_planned_recording_brings_what_it_brings_when_it_is_made(mass):
     )
     assert planner.answer(rows, (candidate,), fit.values) == pytest.approx(float(bound.by_number[2][0]), rel=0.1)
     assert both.diagnosis.verdict == "nothing missing"
+
+
+def test_the_answer_to_a_question_does_not_depend_on_what_else_is_asked():
+    """A tolerance that is in question itself is fitted while another effect is judged."""
+    system, fit = with_base_fit(measured(n=60))
+    questions = [(c,) for c in system.candidates if c.name in ("air_spin", "contact_radius")]
+    for question in questions:
+        alone, among = (planner_alone(system, fit, asked) for asked in ([question], questions))
+        sigma = alone.answer(alone.now, question, fit.values)
+        assert among.answer(among.now, question, fit.values) == pytest.approx(sigma, rel=1e-6)
