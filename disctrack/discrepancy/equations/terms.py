@@ -236,7 +236,7 @@ def usual(equations: Equations) -> tuple[Term, ...]:
 
     A coordinate is a state whose declared rate is another state: rates={"x": "v", "v": ...}; that one is a velocity, on
     which friction and springs act. Any other state is a level (of a tank, a charge, a temperature): it leaks, is fed,
-    runs over into the first of the states that it drives. Coordinates in one unit may be those of a point, or coupled.
+    runs over into the first of the states that it drives. Two or three in one unit may be a point's, or coupled.
     """
     found: list[Term] = []
     written = {y: str(f).strip() for y, f in equations.rates.items()}
@@ -256,7 +256,9 @@ def usual(equations: Equations) -> tuple[Term, ...]:
     for x in (x for x in written if x not in pairs.values()):
         groups.setdefault((x in pairs, equations.units.get(x, "1")), []).append(x)
     for (move, _), several in groups.items():
-        if move and len(several) > 1:
+        if not 1 < len(several) <= 3:  # a point has three coordinates, and of more levels the pairs are too many
+            continue
+        if move:
             velocities = [pairs[x] for x in several]
             found += [quadratic(velocities), coulomb(velocities)]
             found += [across(v, w) for v, w in combinations(velocities, 2)]
