@@ -289,14 +289,15 @@ class _Competition:
     def is_reportable(self, law: LearnedForce) -> bool:
         """Does the law predict held-out data, and leave noise, or nearly all of the excess chi-square explained?
 
-        Better by its values, and not only by an uncertainty that allows for anything. If its residuals are not noise,
-        it also has to be shorter than known terms, and to predict better than these.
+        If its residuals are not noise, it also has to be shorter than known terms, and to predict better than these.
         """
         d = self.diagnosis
         if not self.has_converged(law.fit) or d.held_out_before is None:
             return False
         gain, error = law.held_out.gain_over(d.held_out_before, self.noise), law.held_out.chi_square
-        if not (gain > CLASS_GAIN and error < d.held_out_before.chi_square):
+        # where no two values return, any force is a function of them: by its values, and not by a wide uncertainty
+        closer = len(law.along.variables) == 1 or error < d.held_out_before.chi_square
+        if not (gain > CLASS_GAIN and closer):
             return False
         most = d.settings.unexplained_share * d.before.excess(self.noise)
         predicts = d.held_out_after is None or error < d.held_out_after.chi_square
