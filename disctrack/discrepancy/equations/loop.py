@@ -165,13 +165,13 @@ def _starts(diagnosis: Diagnosis) -> Former:
 def _with_guesses(system: EquationSystem, values: Mapping[str, float]) -> EquationSystem:
     """With an initial guess of every shape that is tried along the motion: where its term gains most to first order."""
     f = system.formulas
-    if not f.along:
-        return system
     passed = [
         f.along_motion(f.along.values(), s.time, motion.states, system.numbers(values, s), system.inputs_of(s))
         for s, motion in system.predictions(values)
         if motion is not None
     ]
+    if not (f.along and passed):  # no shapes, or no motion that ends with the data
+        return system
     shares = (np.arange(SCANNED) + 0.5) / SCANNED
     best: dict[str, tuple[float, dict[str, float]]] = {}
     amounts = [c for c in system.candidates if any(f.owner[n] == c.name for n in f.along)]
