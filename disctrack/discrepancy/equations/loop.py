@@ -98,7 +98,7 @@ def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationS
     if start.followed:
         system, diagnosis = _searched(_with_sizes(start.system, start.values), start.values, settings)
         promising = _promising(diagnosis, start.whole)
-        values = {} if start.whole else diagnosis.after.values
+        values, whole = {} if start.whole else diagnosis.after.values, replace(whole, guesses=system.guesses)
     # stretches may be too short to show what is missing, and a fit without it may stop early: fit some terms first
     if ways := _reached_by(whole, values, promising):
         names, values = next(iter(ways.items()))

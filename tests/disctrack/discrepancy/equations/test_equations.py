@@ -468,7 +468,7 @@ def ending(friction, **sized):
 
 def bumped(past, **sized):
     return case(
-        ({"x": "v", "v": "-k*x - c*v"}, {"k": 132.0, "c": 0.24}),
+        ({"x": "v", "v": "-k*x - c*v"}, {"k": 135.0, "c": 0.25}),
         ({"x": "v", "v": f"-144*x - 0.3*v - 3000*{past}"}, [1.0, 0.0]),
         (0.01 * np.arange(900), {"x": 2e-3}), None, {"k": 144, "c": 0.3} | sized, by={"max_step": 2e-3},
     )  # fmt: skip
@@ -635,6 +635,8 @@ CASES = {
     "the drag of a thrown ball": resisted("0.05*sqrt(v**2 + w**2)", 9.81, {"quadratic_v_w.c": 0.05}),
     "friction of a puck until it rests": resisted("4/sqrt(v**2 + w**2 + 1e-8)", 0.0, {"coulomb_v_w.c": 4.0}),
     "a bumper that nobody offered": bumped("Max(x - 0.5, 0)", **{"stop_x.k": 3000, "stop_x.place": 0.5}),
+    # the fit begins anew with it, at the place that short stretches guessed
+    "a bumper below": bumped("0.47*Min(x + 0.3085, 0)", **{"stop_below_x.k": 1410, "stop_below_x.place": -0.3085}),
     "a pendulum over a turning floor": case(
         ({"x": "v", "y": "w", "v": "-k*x", "w": "-k*y"}, {"k": 3.9}),
         ({"x": "v", "y": "w", "v": "0.1*w - 4*x", "w": "-0.1*v - 4*y"}, [0.5, 0.0, 0.0, 0.1]),
