@@ -4,22 +4,17 @@ import os
 import re
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is loaded; as the command line does, for speed
 
 import numpy as np
 import pytest
-from numba.core.event import install_timer
 
 from disctrack.cli import main
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 CIRCLES = ("slow", "statistical")  # run when they are named: -m statistical, -m slow, or the test itself
-DEFAULT_TEST_S = 2.0  # of processor time: some two thousand tests share three minutes of two cores
-REFERENCE_S = 0.01  # what `_reference` takes on the processor that the limit was set on
 
 
 def circle_of(item: pytest.Item) -> str | None:
@@ -45,43 +40,6 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the inner loops once, before each of several workers does."""
     if getattr(session.config.option, "numprocesses", None) and not session.config.option.collectonly:
         subprocess.run([sys.executable, "-m", "disctrack", "warm-up"], cwd=REPOSITORY, check=True, capture_output=True)
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
-    """Fail a default test that takes more than its share; a slower or busier processor may take longer.
-
-    What numba compiles on the way is not the test's: whichever asks first for a function pays for all.
-    """
-    start, compiling = _processor_time(), []
-    with install_timer("numba:compile", compiling.append):
-        result = yield
-    used = _processor_time() - start - sum(compiling)
-    item.user_properties.append(("processor_s", round(used, 2)))  # for --junitxml
-    if used > DEFAULT_TEST_S and not circle_of(item):
-        limit = DEFAULT_TEST_S * max(1.0, max(_reference() for _ in range(5)) / REFERENCE_S)
-        if used > limit:
-            pytest.fail(
-                f"{used:.1f} s of processor time, {limit:.1f} s allowed: compute less, share it in a fixture, "
-                "or mark it statistical (runs in CI) or slow (runs on demand)",
-                pytrace=False,
-            )
-    return result
-
-
-def _reference() -> float:
-    """Processor time of a fixed piece of work, half in Python and half in NumPy [s]."""
-    start = time.process_time()
-    sum(i * i for i in range(100_000))
-    matrix = np.ones((200, 200))
-    for _ in range(10):
-        matrix = np.tanh(matrix @ matrix / 200)
-    return time.process_time() - start
-
-
-def _processor_time() -> float:
-    """Of this process and of those that it has started and seen to their end [s]."""
-    return time.process_time() + sum(os.times()[2:4])
 
 
 @pytest.fixture
