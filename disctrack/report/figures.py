@@ -96,6 +96,9 @@ def panels(
 def encoded(figure: Figure, kind: str) -> bytes:
     """The figure as a file of this kind ("png", "pdf", "svg"), without the date."""
     FigureCanvasAgg(figure)
+    if engine := figure.get_layout_engine():  # laid out once for all formats
+        engine.execute(figure)
+        figure.set_layout_engine("none")
     undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     content = io.BytesIO()
     with rc_context({"font.size": 10, "svg.fonttype": "path", "svg.hashsalt": "disctrack", "mathtext.fontset": "cm"}):

@@ -404,7 +404,7 @@ def _laws(system: EquationSystem, values: Values, n: int) -> Iterator[Along]:
 
     In a large system, of the variables that its equation contains already, and time.
     """
-    equations = system.formulas.equations
+    equations, turns = system.formulas.equations, _periods(system, values) if n == 1 else {}
     moving = (*equations.states, *equations.inputs)
     velocities = {str(f).strip() for f in equations.rates.values()} & set(equations.rates)
     choices = [*combinations(moving, n), *[("t",)][: 2 - n]]
@@ -415,17 +415,19 @@ def _laws(system: EquationSystem, values: Values, n: int) -> Iterator[Along]:
             if many and not there.issuperset(variables):
                 continue
             yield Along(equation, variables)
-            if n == 1 and (period := _period(system, variables[0], values)):
-                yield Along(equation, variables, period=period)
+            if variables[0] in turns:
+                yield Along(equation, variables, period=turns[variables[0]])
             velocity = n == 1 and variables[0] in {equation, *velocities}
             if velocity and {-1.0, 1.0} <= set(np.sign(_visited(system, variables, values)[:, 0]).tolist()):
                 yield Along(equation, variables, jumps=True)
 
 
-def _period(system: EquationSystem, name: str, values: Values) -> float:
-    """A turn, if it is an angle of which more than that was seen; else 0."""
-    turn = TURNS.get(system.formulas.equations.units.get(name, ""), np.inf)
-    return turn if np.ptp(_visited(system, (name,), values)) > turn else 0.0
+def _periods(system: EquationSystem, values: Values) -> dict[str, float]:
+    """A turn, of each state that is an angle and of which more than that was seen."""
+    e = system.formulas.equations
+    turns = {state: TURNS[e.units[state]] for state in e.states if e.units.get(state) in TURNS}
+    seen = np.ptp(_visited(system, [*turns], values), axis=0) if turns else []
+    return {state: turn for (state, turn), range_ in zip(turns.items(), seen, strict=True) if range_ > turn}
 
 
 def _forced(equations: Equations) -> list[str]:
@@ -446,8 +448,8 @@ def _knowing(system: EquationSystem, channels: Mapping[str, Formula], n: int, va
         constants |= dict.fromkeys([f"{own}_of_{name}" for name in (*e.states, *e.inputs, "t")] + [f"{own}_from"], 0.0)
         constants[f"{own}_span"] = 1.0
     # functions that no law has would cost as much as the others
-    turns = n == 1 and any(_period(system, state, values) for state in e.states)
-    basis = {name: formula for name, (formula, _) in _basis(n).items() if turns or not name.startswith("b")}
+    omitted = () if n == 1 and _periods(system, values) else ("b",)
+    basis = {name: formula for name, (formula, _) in _basis(n).items() if not name.startswith(omitted)}
     course = " + ".join(f"own_{name}*{formula.format(**words)}" for name, formula in basis.items())
     term = Term(
         NAME, {s: f"{NAME}_on_{s}*({course})" for s in _forced(e)},

@@ -69,7 +69,8 @@ def find_missing(
     short = len(system.stretches) > len(given) and shooting.longest_duration(system) < shooting.shortest_period(whole)
     if diagnosis.verdict == "nothing missing" and short:
         reason = "the model follows less than a period of the motion, and has no term with which it follows more"
-        diagnosis, notes = replace(diagnosis, verdict="unexplained", reason=reason), [*notes, reason]
+        diagnosis = replace(diagnosis, verdict="unexplained", reason=reason)
+        notes.append(reason)
     judged = diagnosis.judged or system
     law = learn(system, diagnosis, channels, None if judged is system else judged)
     named = law is not None and law.is_named(diagnosis)
@@ -98,7 +99,9 @@ def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationS
     if start.followed:
         system, diagnosis = _searched(_with_sizes(start.system, start.values), start.values, settings)
         promising = _promising(diagnosis, start.whole)
-        values, whole = {} if start.whole else diagnosis.after.values, replace(whole, guesses=system.guesses)
+        values = {}  # a fit of whole runs that stopped early begins anew
+        if not start.whole:
+            values, whole = diagnosis.after.values, replace(whole, guesses=system.guesses)
     # stretches may be too short to show what is missing, and a fit without it may stop early: fit some terms first
     if ways := _reached_by(whole, values, promising):
         names, values = next(iter(ways.items()))
@@ -167,10 +170,10 @@ def _with_guesses(system: EquationSystem, values: Mapping[str, float]) -> Equati
     f = system.formulas
     passed = [
         f.along_motion(f.along.values(), s.time, motion.states, system.numbers(values, s), system.inputs_of(s))
-        for s, motion in system.predictions(values)
+        for s, motion in (system.predictions(values) if f.along else [])
         if motion is not None
     ]
-    if not (f.along and passed):  # no shapes, or no motion that ends with the data
+    if not passed:  # no shapes, or no motion that ends with the data
         return system
     shares = (np.arange(SCANNED) + 0.5) / SCANNED
     best: dict[str, tuple[float, dict[str, float]]] = {}

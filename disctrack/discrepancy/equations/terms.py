@@ -97,7 +97,7 @@ def coupling(v: str, x: str, w: str, y: str, name: str = "") -> Term:
 
     What it gives to one and takes from the other differs if their masses or capacities do.
     """
-    rates, title = {v: f"-own_a*({x} - {y})", w: f"own_b*({x} - {y})"}, f"linear coupling of {x} and {y}"
+    rates, title = {v: f"-own_a*(({x}) - ({y}))", w: f"own_b*(({x}) - ({y}))"}, f"linear coupling of {x} and {y}"
     return Term(name or f"coupling_{x}_{y}", rates, parameters={"a": _ANY, "b": _ANY}, title=title)
 
 
