@@ -59,8 +59,12 @@ class Linearisation:
         self.quantities = {q.name: q for q in everything}
         self.values = values | {name: q.null for name, q in new.items()}
         self._at = np.array([*(values[q.name] for q in self.fitted), *(q.null for q in new.values())])
-        free = [i for i, q in enumerate(self.fitted) if q.lower < self._at[i] < q.upper]
-        self.basis = np.linalg.qr(_normalised(self.matrix[:, free]))[0]
+        self.basis = self.basis_without(())
+
+    def basis_without(self, freed: Sequence[str]) -> Array:
+        """Orthonormal basis (m, b) of the fitted columns, without those of quantities that a candidate frees."""
+        free = [i for i, q in enumerate(self.fitted) if q.name not in freed and q.lower < self._at[i] < q.upper]
+        return np.linalg.qr(_normalised(self.matrix[:, free]))[0]
 
     def columns(self, names: Sequence[str]) -> Array:
         """Columns (m, k), not orthogonalised."""
@@ -114,7 +118,9 @@ def score(linear: Linearisation, candidate: Candidate) -> Score:
         k = len(candidate.names)
         return Score(candidate, np.full(k, np.nan), np.full(k, np.inf), 0.0, False)
     gain, values = linear.gain_of(candidate.names)
-    return Score(candidate, values, sigmas(linear.columns(candidate.names), linear.basis), gain, True)
+    freed = any(q.name in candidate.names for q in linear.fitted)
+    basis = linear.basis_without(candidate.names) if freed else linear.basis
+    return Score(candidate, values, sigmas(linear.columns(candidate.names), basis), gain, True)
 
 
 def sigmas(columns: Array, basis: Array) -> Array:

@@ -212,15 +212,13 @@ def sigmas_of_first(system: JointSystem, fit_: Fit, numbers: Sequence[int]) -> d
     column = {q.name: i for i, q in enumerate(everything)}
     _, derivative = system.linearise({q.name: q.null for q in new.values()} | fit_.values, list(column))
     priors = np.diag([1.0 / q.prior_sigma for q in everything])
-    found: dict[int, dict[str, Array]] = {}
+    found: dict[int, dict[str, Array]] = {k: {} for k in numbers}
     for k in numbers:
-        matrix = triangle(np.concatenate([derivative[:k].reshape(-1, len(everything)), priors]))
-        found[k] = {
-            c.name: sigmas(
-                matrix[:, [column[n] for n in c.names]], span(matrix[:, [column[n] for n in known if n not in c.names]])
-            )
-            for c in system.candidates
-        }
+        rows = triangle(derivative[:k].reshape(-1, len(everything)))
+        for c in system.candidates:  # without the tolerances of what it frees
+            own, others = [column[n] for n in c.names], [column[n] for n in known if n not in c.names]
+            matrix = np.concatenate([rows, np.delete(priors, own, axis=0)])
+            found[k][c.name] = sigmas(matrix[:, own], span(matrix[:, others]))
     return found
 
 
