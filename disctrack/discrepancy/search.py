@@ -28,7 +28,7 @@ from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
 CLASS_GAIN = 10.0  # two explanations whose lengths differ by less are indistinguishable (odds of e^5)
 OBVIOUS = 5.0  # times its penalty: a gain so large needs no confirmation by held-out data
-WIDTH = 2  # explanations that are extended as long as the residuals of none are noise
+WIDTH = 2  # explanations of each number of effects that are extended as long as the residuals of none are noise
 ROUGH = 1e-2  # share of the chi-square at stake: a promised gain below it does not matter where chi-square is rough
 FAINT = 1e3  # chi-square of an effect, below which many others may explain the same
 MOST_ALTERNATIVES = 12
@@ -380,14 +380,17 @@ class _Search:
         return sorted((e for e in self.pool.values() if np.isfinite(self.length(e))), key=self.length)
 
     def _explore(self) -> None:
-        """Extend and reduce the shortest explanations until none gets shorter."""
+        """Extend and reduce the shortest explanations of each number of effects until none gets shorter."""
         while True:
             ranked = self._ranked()
             best = ranked[0]
             if best.candidates:
                 # a large effect contaminates the estimate of the noise: once it is fitted, the estimate is better
                 self.noise = min(self.noise, self._noise(best.fit))
-            few = ranked[: 1 if self._at_noise(best.fit) else WIDTH]
+            few = ranked[:1]
+            if not self._at_noise(best.fit):  # several effects may be short only together
+                sizes = [[e for e in ranked if len(e.candidates) == n] for n in range(self.settings.max_effects + 1)]
+                few += [e for alike in sizes for e in alike[:WIDTH]]
             new = next((e for e in few if e.names not in self.expanded), None)
             if new is None:
                 return
@@ -411,9 +414,8 @@ class _Search:
         if fitted is None:  # there is no start
             return
         gain = (e.fit.cost - fitted.cost) / self.noise
-        new = Explanation(together, fitted)
-        rough = self.rough and fitted.promised < ROUGH * gain
-        if not (fitted.converged or rough) or (self.length(new) < self.length(e) and self._is_implausible(new, extra)):
+        new = Explanation(together, fitted, self._has_ended(e.fit, fitted))
+        if self.length(new) < self.length(e) and self._is_implausible(new, extra):
             new = replace(new, plausible=False)
         if names not in self.pool or self.length(new) < self.length(self.pool[names]):
             self.pool[names] = new
@@ -427,9 +429,14 @@ class _Search:
         names = _names(together)
         if names not in self.pool:
             fitted = self._fit(together, start)
-            new = Explanation(together, fitted, fitted.converged)
+            new = Explanation(together, fitted, self._has_ended(self.base_model.fit, fitted))
             self.pool[names] = replace(new, plausible=False) if tested and self._is_implausible(new, tested) else new
         return self.pool[names]
+
+    def _has_ended(self, before: Fit, fitted: Fit) -> bool:
+        """Converged; or, where chi-square is rough, with little left to gain?"""
+        gain = (before.cost - fitted.cost) / self.noise
+        return fitted.converged or (self.rough and fitted.promised < ROUGH * gain)
 
     def _refit_without(self, e: Explanation, c: Candidate) -> Explanation:
         return self._explanation(*_without(e, c))

@@ -320,10 +320,10 @@ class _Competition:
         scans.sort(key=lambda scan: scan[0])
         if not scans:
             return None
-        trials = []
+        trials, shortest = [], min((length for length, law, _ in scans if not law.of_time), default=0.0)
+        # where the declared equations do not follow the data, the first order is a rough guide
+        enough = ROUGHLY * shortest + WORTH if self.far else shortest + CLASS_GAIN
         for length, law, quantities in scans[:REFITTED]:
-            # where the declared equations do not follow the data, the first order is a rough guide
-            enough = ROUGHLY * scans[0][0] + WORTH if self.far else scans[0][0] + CLASS_GAIN
             if length > enough or not self.system.budget.open():
                 break
             with suppress(GivenUp), self.system.budget.trial(self.system.trial_steps):

@@ -94,16 +94,18 @@ def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationS
     if held := unidentifiable(start.system, start.values) if start.followed > 0.0 else ():
         whole = replace(whole, held=held)
         start = shooting.fitted_start(whole, declared)
-    values = declared
+    values, left = declared, np.inf
     promising: list[tuple[str, ...]] = [(c.name,) for c in whole.candidates]
     if start.followed:
         system, diagnosis = _searched(_with_sizes(start.system, start.values), start.values, settings)
         promising = _promising(diagnosis, start.whole)
         values = {}  # a fit of whole runs that stopped early begins anew
-        if not start.whole:
+        if start.whole:
+            left = shooting.misfits(whole, diagnosis.ranked[0].fit.values).max() if diagnosis.ranked else np.inf
+        else:
             values, whole = diagnosis.after.values, replace(whole, guesses=system.guesses)
     # stretches may be too short to show what is missing, and a fit without it may stop early: fit some terms first
-    if ways := _reached_by(whole, values, promising):
+    if ways := _reached_by(whole, values, promising, left):
         names, values = next(iter(ways.items()))
         system, diagnosis = _searched(_with_sizes(whole, values), values, settings, ways)
         note = f"the fit was reached with {' and '.join(sorted(names))}: without it the model loses longer stretches"
@@ -194,12 +196,15 @@ def _with_guesses(system: EquationSystem, values: Mapping[str, float]) -> Equati
 
 
 def _reached_by(
-    system: EquationSystem, values: Values, terms: Collection[tuple[str, ...]]
+    system: EquationSystem, values: Values, terms: Collection[tuple[str, ...]], most: float
 ) -> dict[frozenset[str], dict[str, float]]:
-    """Terms with which multiple shooting reaches whole runs, with the values; the best first."""
+    """Terms with which multiple shooting reaches whole runs, with the values; the best first.
+
+    most : misfit of a known explanation, to which each of them has to be closer
+    """
     ways = {frozenset(names): shooting.fitted_start(replace(system, promoted=names), values) for names in terms}
-    whole = {names: way.values for names, way in ways.items() if way.whole}
-    return dict(sorted(whole.items(), key=lambda item: shooting.misfits(system, item[1]).max()))
+    misfits = {names: shooting.misfits(system, way.values).max() for names, way in ways.items() if way.whole}
+    return {names: ways[names].values for names in sorted(misfits, key=misfits.__getitem__) if misfits[names] < most}
 
 
 def _with_guessed_sizes(system: EquationSystem) -> tuple[EquationSystem, dict[str, float]]:
