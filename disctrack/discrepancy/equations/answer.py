@@ -102,7 +102,7 @@ class Answer:
         elif known:
             notes.append(f"of known terms {known} come nearest (the law: {longer})")
         if law.held and named:
-            notes.append(f"{' and '.join(law.held)} is a part of the law, and has no meaning by itself")
+            notes.append(f"without the law these numbers have no meaning: {', '.join(law.held)}")
         if law.along.of_time:
             notes.append("a force that depends on time alone describes any motion, and is never what is missing")
         if law.equivalent:
@@ -125,10 +125,10 @@ class Answer:
 
     def _departure_notes(self) -> list[str]:
         """Fitted parameters far from their declared values, as by a wrong sign or unit."""
-        notes, fitted = [], self.diagnosis.after
+        notes, fitted, in_law = [], self.diagnosis.after, self.law.held if self.law else ()
         for q in fitted.quantities:
             value, declared = fitted.values[q.name], q.null if np.isfinite(q.prior_sigma) else q.declared
-            if declared is None or q.owner == NAME:
+            if declared is None or q.owner == NAME or q.name in in_law:
                 continue
             text = f"{q.name.removeprefix('state.')} = {value:.4g} where {declared:.4g} was declared"
             if (away := abs(value - declared) / q.prior_sigma) > FAR_OFF:
@@ -187,7 +187,7 @@ class Answer:
             off = [(s.run, float(t)) for (s, _), r in zip(predicted, left, strict=True) for t in s.time[r > limit]]
             if limit > 0 and 0 < len(off) < FEW * sum(np.isfinite(r).sum() for r in left):
                 some = ", ".join(f"{run} at {t:.4g} s" for run, t in off[:4]) + (", ..." if len(off) > 4 else "")
-                lie = "1 lies" if len(off) == 1 else f"{len(off)} lie"
+                lie = "1 sample lies" if len(off) == 1 else f"{len(off)} samples lie"
                 notes.append(
                     f"{lie} farther off in {channel} than {OUTLIER:.0f} times the scatter of the others ({some}): "
                     "if the sensor erred there, write NaN; if not, more is missing there"

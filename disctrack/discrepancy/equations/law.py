@@ -320,20 +320,23 @@ class _Competition:
         scans.sort(key=lambda scan: scan[0])
         if not scans:
             return None
-        trials, shortest = [], min((length for length, law, _ in scans if not law.of_time), default=0.0)
+        trials: list[LearnedForce] = []
+        shortest = min((length for length, law, _ in scans if not law.of_time), default=0.0)
         # where the declared equations do not follow the data, the first order is a rough guide
         enough = ROUGHLY * shortest + WORTH if self.far else shortest + CLASS_GAIN
         for length, law, quantities in scans[:REFITTED]:
             if length > enough or not self.system.budget.open():
                 break
-            with suppress(GivenUp), self.system.budget.trial(self.system.trial_steps):
-                if (trial := self._fit_over_levels(law, known, quantities, values)) is not None:
-                    trials.append(trial)
+            trials += self._fitted(law, known, quantities, values, self.shots)
         if not trials:
             return None
         near = equivalent([trial for trial in trials if self.has_converged(trial.fit)] or trials)
         # a function of time fits any motion: a function of the state says more, and is tested by every other run
         best = min(near, key=lambda trial: trial.along.of_time)
+        if known:  # which may only have led to the law
+            without = best.fit.values | {q.name: q.null for c in known for q in c.quantities}
+            alone = self._fitted(best.along, (), best.candidate.quantities, without, self.shots[-1:])
+            best = min(best, *alone, key=lambda trial: trial.length) if alone else best
         others = (replace(t.along, jumps=False) for t in near if t.along.title != best.along.title)
         return replace(best, equivalent=tuple(dict.fromkeys(others)))
 
@@ -375,15 +378,25 @@ class _Competition:
             replace(q, prior_sigma=sigma, scale=1e-3 * sigma) for q, sigma in quantities
         )
 
+    def _fitted(
+        self, law: Along, known: tuple[Candidate, ...], own: tuple[Quantity, ...], values: Values,
+        shots: Sequence[EquationSystem],
+    ) -> list[LearnedForce]:  # fmt: skip
+        """The law fitted over longer and longer stretches; none where it loses the data, or takes too many steps."""
+        with suppress(GivenUp), self.system.budget.trial(self.system.trial_steps):
+            found = self._fit_over_levels(law, known, own, values, shots)
+            return [] if found is None else [found]
+        return []
+
     def _fit_over_levels(
-        self, law: Along, known: tuple[Candidate, ...], own: tuple[Quantity, ...], values: Values
-    ) -> LearnedForce | None:
-        """The law fitted by multiple shooting, over longer and longer stretches; None where it loses the data."""
-        first, numbers = _set(self.shots[0], law, values)
-        now = dict(values) | {q.name: 0.0 for q in own} | numbers
-        for system in self.shots:
+        self, law: Along, known: tuple[Candidate, ...], own: tuple[Quantity, ...], values: Values,
+        shots: Sequence[EquationSystem],
+    ) -> LearnedForce | None:  # fmt: skip
+        first, numbers = _set(shots[0], law, values)
+        now = {q.name: 0.0 for q in own} | dict(values) | numbers
+        for system in shots:
             there = replace(system, widths=first.widths)
-            others, view = self._others(there, known), self.view(there) if system is self.shots[-1] else there
+            others, view = self._others(there, known), self.view(there) if system is shots[-1] else there
             fitted = fit(view, (*others, *own), now, TRIAL)
             if not fitted.reduced_chi_square < FAR * self.noise:  # longer stretches leave more
                 return None

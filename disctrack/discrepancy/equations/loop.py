@@ -56,9 +56,13 @@ def find_missing(
     if all(fitted_rows(s).all() for s in given):
         raise AnalysisError("no run keeps samples back to judge the fit: give one of them a smaller fit_until.")
     channels = equations.channels(runs[0])
-    offered = tuple(library.usual(replace(equations, observed=channels)) if terms is None else terms)
-    compiled = Formulas(equations, offered, channels)
-    notes = [n for c, name in enumerate(compiled.channels) for n in _sensor_notes(given, c, name)]
+    sensors = {name: _sensor_notes(given, c, name) for c, name in enumerate(channels)}
+    notes = [note for told, _ in sensors.values() for note in told]
+    if terms is None:
+        limits = (library.sensor_limit(n, str(channels[n]), side) for n, (_, ends) in sensors.items() for side in ends)
+        by_name = {term.name: term for term in (*library.usual(replace(equations, observed=channels)), *limits)}
+        terms = tuple(by_name.values())
+    compiled = Formulas(equations, tuple(terms), channels)
     whole = EquationSystem(compiled, with_noise(given), np.ones(len(compiled.states)), {})
     system, diagnosis, more = _first_answer(whole, settings)
     notes += more
@@ -365,9 +369,9 @@ def _failure(system: EquationSystem, values: Mapping[str, float]) -> str:
     )
 
 
-def _sensor_notes(samples: Sequence[Samples], channel: int, name: str) -> list[str]:
-    """Notes on the resolution of a sensor, and on limits of its range."""
-    notes = []
+def _sensor_notes(samples: Sequence[Samples], channel: int, name: str) -> tuple[list[str], list[int]]:
+    """Notes on the resolution of a sensor, and on limits of its range; sides (1: above, -1) on which it is at one."""
+    notes, sides = [], []
     values = [s.data[:, channel] for s in samples if np.isnan(s.sigma[:, channel]).any()]
     step = quantisation(values) if values else 0.0
     if step and noise_sigma(values) < 3 * step:
@@ -376,11 +380,12 @@ def _sensor_notes(samples: Sequence[Samples], channel: int, name: str) -> list[s
     least, most = np.nanmin(everything, initial=np.inf), np.nanmax(everything, initial=-np.inf)
     if least == most:
         raise AnalysisError(f"{name} shows {most:g} at all times: its sensor is dead. Leave it out.")
-    for limit, which in ((most, "largest"), (least, "smallest")):
+    for side, limit, which in ((1, most, "largest"), (-1, least, "smallest")):
         count = int(np.sum(everything == limit))
         if not step and count > STANDS:  # noise repeats no value; an encoder at rest does
+            sides.append(side)
             notes.append(
-                f"{name} shows its {which} value, {limit:.4g}, {count} times: where its sensor is dead or at its "
-                "limit, write NaN, or offer terms.sensor_limit"
+                f"{name} shows its {which} value, {limit:.4g}, {count} times: its sensor is at its limit there "
+                "(terms.sensor_limit), or dead (write NaN)"
             )
-    return notes
+    return notes, sides

@@ -186,12 +186,15 @@ def sensor_curvature(channel: str, shown: str = "", name: str = "") -> Term:
     return _shown(channel, formula, name or f"curvature_{channel}", title, q=_ANY)
 
 
-def sensor_limit(channel: str, shown: str = "", name: str = "") -> Term:
-    """Above a fitted value the sensor saturates (share 1).   shown : its formula, if a state has its name"""
-    shown = shown or channel
-    formula, title = f"-own_share*Max(({shown}) - own_top, 0)", f"{channel} is limited by its sensor"
-    top = Parameter(0.0, shape=True, along=shown)
-    return _shown(channel, formula, name or f"limit_{channel}", title, share=_SHARE, top=top)
+def sensor_limit(channel: str, shown: str = "", side: int = 1, name: str = "") -> Term:
+    """Above a fitted value the sensor saturates (share 1).
+
+    shown : its formula, if a state has its name;  side : -1 for a lower limit
+    """
+    shown, below = shown or channel, "" if side > 0 else "_below"
+    formula = f"-{side}*own_share*Max({side}*(({shown}) - own_top), 0)"
+    top, title = Parameter(0.0, shape=True, along=shown), f"{channel} is limited{below.replace('_', ' ')} by its sensor"
+    return _shown(channel, formula, name or f"limit{below}_{channel}", title, share=_SHARE, top=top)
 
 
 def sensor_lag(channel: str, name: str = "") -> Term:

@@ -187,5 +187,8 @@ def test_a_wrong_sign_a_sensor_at_its_limit_and_a_dead_one_are_told():
     clipped = diagnose(swing, Run(TIME, {"x": np.minimum(x, 0.9)}, sigma=0.01), [terms.viscous("w")])
     assert any("at its limit" in note for note in clipped.notes)
     assert not any("at its limit" in note for note in wrong.notes)
+    below = diagnose(swing, Run(TIME, {"x": np.maximum(x, -0.9)}, sigma=0.01))  # a usual term where the data show it
+    assert below.found == ("limit_below_x",)
+    assert below.values["limit_below_x.top"] == pytest.approx(-0.9, abs=2e-3)
     with pytest.raises(AnalysisError, match="its sensor is dead"):
         diagnose(swing, Run(TIME, {"x": 0 * TIME}), DRAG)

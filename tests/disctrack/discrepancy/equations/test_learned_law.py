@@ -71,6 +71,35 @@ def test_a_law_of_one_variable_is_learned(name):
         assert answer.after["x"].rms == pytest.approx(SIGMA, rel=0.1)
 
 
+def test_a_law_of_time_that_fits_first_does_not_keep_a_law_of_the_state_from_being_tried(rng):
+    """A circuit with a diode, far from the equations without one."""
+    t = np.arange(0, 20, 0.02)
+    u = 2 * np.sin(1.3 * t) + 1.5 * np.sin(0.41 * t + 1)
+    circuit = solve_ivp(
+        lambda s, q: (np.interp(s, t, u) - q) / 0.5 - 0.05 * (np.exp(q / 0.4) - 1), (0, t[-1]), [0.0], t_eval=t,
+        rtol=1e-8, atol=1e-10, max_step=0.02,
+    )  # fmt: skip
+    run = Run(t, {"q": circuit.y[0] + 0.005 * rng.standard_normal(len(t))}, inputs={"u": u})
+    answer = diagnose(Equations({"q": "(u - q)/tau"}, {"tau": 0.4}, inputs=["u"], units={"q": "V"}), run)
+    assert answer.found == (NAME,)
+    assert answer.law.along.variables == ("q",)
+
+
+def test_terms_that_explain_the_data_only_together_are_found(rng):
+    """An epidemic whose immunity is lost: into s flows 0.01 (1000 - s - i), which is three of the usual terms."""
+    t = np.arange(120.0)
+    epidemic = solve_ivp(
+        lambda _, y: [-0.3e-3 * y[0] * y[1] + 0.01 * (1000 - y[0] - y[1]), 0.3e-3 * y[0] * y[1] - 0.1 * y[1]],
+        (0, 120), [990.0, 10.0], t_eval=t, rtol=1e-9, atol=1e-9,
+    )  # fmt: skip
+    s, i = epidemic.y + [[2.0], [1.0]] * rng.standard_normal((2, len(t)))
+    declared = Equations({"s": "-b*s*i/1000", "i": "b*s*i/1000 - g*i"}, {"b": 0.25, "g": 0.12})
+    answer = diagnose(declared, Run(t, {"s": s, "i": i}))
+    named = [{f.candidate.name, *(a.candidate.name for a in f.cannot_be_told_from)} for f in answer.diagnosis.found]
+    assert len(named) == 3
+    assert {"constant_s", "viscous_s", "coupling_s_i"} <= set().union(*named)
+
+
 def test_a_law_of_an_angle_that_goes_round_is_the_same_in_every_turn(rng):
     """A dent that brakes a motor once a turn: over ten turns no smooth function of the angle has it."""
 
