@@ -256,7 +256,7 @@ def add_validate(parser: argparse.ArgumentParser) -> None:
     _value(parser, "-j --jobs JOBS", _positive, "processes (%(default)s)", default=1)
     _file(parser, "-o --output", "folder of tables (%(default)s)", default=Path("validation"))
     _file(parser, "--write", "also put the tables into this Markdown page", metavar="FILE")
-    _flag(parser, "--quiet", "no line for every recording")
+    _flag(parser, "--quiet", "no progress bar")
 
 
 def _last_seconds(parser: argparse.ArgumentParser, name: str, default: float, what: str) -> None:

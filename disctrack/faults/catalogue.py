@@ -221,10 +221,10 @@ def faults_of(disc: Disc) -> tuple[Fault, ...]:
 
 @cache
 def _faults_of(n_markers: int) -> tuple[Fault, ...]:
-    return tuple(one for fault in FAULTS for one in _each(fault, n_markers))
+    return tuple(one for fault in FAULTS for one in each_of(fault, n_markers))
 
 
-def _each(fault: Fault, n_markers: int) -> Iterator[Fault]:
+def each_of(fault: Fault, n_markers: int) -> Iterator[Fault]:
     """A fault of a camera or a dot for each of these; other faults unchanged."""
     if fault.each == "camera":
         for camera in CAMERAS:

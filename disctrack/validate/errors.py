@@ -30,15 +30,10 @@ class PoseErrors:
         return np.asarray(np.isfinite(self.error).all(axis=1))
 
     @property
-    def gross(self) -> Mask:
-        """(n,) True if the reported pose is wrong."""
-        size = np.linalg.norm(self.error.reshape(-1, 2, 3), axis=2)
-        return np.asarray((size > GROSS).any(axis=1))
-
-    @property
     def usable(self) -> Mask:
-        """(n,) found and not gross."""
-        return np.asarray(self.found & ~self.gross)
+        """(n,) True if a pose is reported that is not wrong."""
+        sizes = np.linalg.norm(self.error.reshape(-1, 2, 3), axis=2)
+        return np.asarray((sizes <= GROSS).all(axis=1))
 
     def of(self, quantity: str) -> Array:
         """Errors of a coordinate (n,), or of "position" or "rotation" about all axes (3 n,) [m, rad], of usable poses.
@@ -81,34 +76,29 @@ def joined(parts: Iterable[PoseErrors]) -> PoseErrors:
     return PoseErrors(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
-def _consistency(values: Sequence[float] | Array) -> dict[str, float]:
-    """Normalised squared error per degree of freedom, 1 if the reported covariance is correct; its error if it were."""
+def squared(error: Array, covariance: Array) -> Array:
+    """(n,) e^T C^-1 e / 6 of errors (n, 6), on average 1 with the correct covariance C (n, 6, 6)."""
+    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0]) / 6
+
+
+def consistency(values: Sequence[float] | Array) -> dict[str, float]:
+    """Mean of `squared` over poses or rigs, and its standard error if the reported covariance is correct."""
     n = len(values)
-    mean = float(np.mean(values)) if n else float("nan")
-    return {"value": mean, "standard error": float(np.sqrt(2 / (6 * max(n, 1)))), "poses or rigs": n}
+    value = float(np.mean(values)) if n else float("nan")
+    return {"value": value, "standard error": float(np.sqrt(2 / (6 * max(n, 1)))), "poses or rigs": n}
 
 
-def _normalised(errors: Array, covariance: Array) -> Array:
-    """(n,) e^T C^-1 e / 6."""
-    return np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors[..., None])[..., 0]) / 6
-
-
-def noise_consistency(comparison: PoseErrors) -> dict[str, float]:
-    """Mean of e^T C^-1 e / 6 with C the reported noise covariance; e must be free of calibration errors."""
-    ok = comparison.usable
-    return _consistency(_normalised(comparison.error[ok], comparison.covariance[ok]))
+def noise_consistency(errors: PoseErrors) -> dict[str, float]:
+    """Squared error over the reported variance of the noise; the errors must be free of calibration errors."""
+    return consistency(squared(errors.error, errors.covariance)[errors.usable])
 
 
 def calibration_consistency(pairs: Iterable[tuple[PoseErrors, PoseErrors]]) -> dict[str, float]:
     """Squared calibration error over its reported variance, from the same images measured with two rigs.
 
     pairs : poses of each recording with its own calibration and with the true cameras. Both have the same image noise,
-    so their difference d is the calibration error alone. It is common to a recording, which therefore counts once, with
-    the mean over its poses of d^T C^-1 d / 6.
+    so their difference is the calibration error alone. It is common to a recording, which therefore counts once, with
+    the mean over its poses.
     """
-    values = []
-    for own, true in pairs:
-        ok = own.usable & true.usable
-        if ok.any():
-            values.append(float(_normalised((own.error - true.error)[ok], own.calibration_covariance[ok]).mean()))
-    return _consistency(values)
+    of_rigs = (squared(a.error - b.error, a.calibration_covariance)[a.usable & b.usable] for a, b in pairs)
+    return consistency([float(values.mean()) for values in of_rigs if len(values)])

@@ -2,12 +2,12 @@
 
 Planted effects use other formulas than the diagnosis: cameras, table and dots those of the renderer's `faults`; clocks
 change the instants of the simulation; exposures are a mean over instants. The rig of the trajectory differs from the
-true one by an error drawn from its covariance. The residual lens field of a laboratory is a sum of waves, as in the
-renderer; glare displaces each dot independently; the table is determined from a bowed board.
+true one by an error drawn from its covariance. With imperfections of the laboratory, the residual lens field is a sum
+of waves, as in the renderer; glare displaces each dot independently; the table is determined from a bent board.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,12 +16,14 @@ from calibration.cameras.camera import N_RIG, StereoRig, by_turning
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import normal_of_rows
 from disctrack.disc import Disc
+from disctrack.errors import DiscTrackError
+from disctrack.faults.catalogue import scene_faults
 from disctrack.faults.dots import cameras_with, ellipse_centre_shift, marker_pixels
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_euler
-from disctrack.rolling import simulate
+from disctrack.rolling import CATALOGUE, Model, simulate
 from disctrack.synthetic.cameras import board_poses, rig_of
-from disctrack.synthetic.description import Scene
+from disctrack.synthetic.description import CameraSettings, ImperfectionSettings, Scene
 from disctrack.synthetic.motion import rolling_model, rolling_start, true_frame_rate
 from disctrack.synthetic.optics import smooth_field
 from disctrack.synthetic.recording import true_disc_of
@@ -33,23 +35,45 @@ Motion = Callable[[Array], Array]  # times (k,) [s] -> coordinates q (k, 6)
 
 SIGMA_PX = 0.006  # of the centre of a dot: 0.5 um and 1.3 mdeg per pose, as in the reference recordings
 CORNER_SIGMA_PX = 0.01
+DURATION = (0.4, 0.9)  # [s]
+FLATTEST_DEG = 0.9  # smallest nutation of the last frame: below, the disc touches its paper
+RATE = CameraSettings().frame_rate_hz
 STATION = 0.002  # [s] time of the first frame after the start of the motion
 
 
-@dataclass(frozen=True)
-class Laboratory:
-    """Usual errors of a laboratory; all off by default."""
-
-    lens_px: float = 0.0  # rms of each camera's smooth residual field, per coordinate
-    glare_px: float = 0.0  # rms of an independent field for each dot and camera
-    print_m: float = 0.0  # rms error of the dots' positions, per coordinate
-    board_bow_m: float = 0.0  # standard deviation of the height of the table in the calibrated axes ...
-    board_tilt: float = 0.0  # ... and of its tilt about x and y [rad]
-    board_scale: float = 0.0  # relative error of the squares
+# Changes of a scene: an ordinary laboratory, with the paper of an ordinary printer
+LABORATORY = {
+    "imperfections": {"lens_field_px": 0.02, "board_bow_mm": 0.06, "board_stretch": 2e-4},
+    "faults": {"misprint_sigma_mm": 3e-3},
+}
+TABLE_BY_BOW = np.array([2 / 3, 2.0, 2.0])  # [m, rad, rad] error of the table's height and tilts per metre of bow
 
 
-# Lens of 0.02 px, board with a bow of 60 um and squares 0.02 % too long, printer, glare and gradients of light.
-ORDINARY = Laboratory(0.02, 0.004, 3e-6, 40e-6, 1.2e-4, 1e-4)
+def drawn(seed: int, planted: Mapping[str, float], rate: float = RATE) -> Scene:
+    """A scene with a random motion that, with the planted effects and faults, lasts for the whole recording."""
+    rng = np.random.default_rng([seed, 31])
+    disc = Scene().declared_disc
+    scene = Scene(seed=seed, faults=scene_faults(disc, planted, rate))
+    of_motion = {name: value for name, value in planted.items() if name.partition(".")[0] in CATALOGUE}
+    for _ in range(200):
+        theta = rng.uniform(3.0, 15.0)
+        n = int(rate * rng.uniform(*DURATION))
+        start = {
+            "theta_deg": theta,
+            "nutation_deg": theta * rng.uniform(0.02, 0.1),
+            "omega3_rad_s": rng.uniform(-2.0, 3.0),
+        }
+        model = Model(disc).with_values({"km.k_m": rng.uniform(0.2e-7, 0.5e-7)} | of_motion)
+        effects = {effect.name: dict(effect.values) for effect in model.effects}
+        cameras = {"frame_rate_hz": rate, "n_frames": n}
+        scene = scene.changed(cameras=cameras, motion={"kind": "rolling", "rolling": start | {"effects": effects}})
+        try:
+            motion = simulate(model, rolling_start(scene), duration=1.03 * n / rate + 0.01, rate=rate)
+        except DiscTrackError:  # no regular precession exists
+            continue
+        if len(motion) > 1.02 * n and motion.q[-1, 4] > np.radians(FLATTEST_DEG):
+            return scene
+    raise DiscTrackError(f"no motion of {DURATION[0]} s among those drawn: what is planted stops the disc at once")
 
 
 def rig_covariance(rig: StereoRig, scene: Scene) -> Array:
@@ -63,12 +87,7 @@ def rig_covariance(rig: StereoRig, scene: Scene) -> Array:
 
 
 def measured(
-    scene: Scene,
-    laboratory: Laboratory = Laboratory(),
-    *,
-    motion: Motion | None = None,
-    sigma_px: float = SIGMA_PX,
-    noise_seed: int | None = None,
+    scene: Scene, *, motion: Motion | None = None, sigma_px: float = SIGMA_PX, noise_seed: int | None = None
 ) -> Trajectory:
     """Trajectory of the disc of a scene, with random initial psi and phi, as measured without knowledge of the faults.
 
@@ -84,15 +103,16 @@ def measured(
     # drawn from the correlations: k3 has a sigma of 100, a rotation of 1e-4, and rounding errors must not mix them
     sigma = np.sqrt(np.diag(covariance))
     error = sigma * of_rig.multivariate_normal(np.zeros(N_RIG), covariance / np.outer(sigma, sigma), method="eigh")
-    scene = _in_the_laboratory(scene, laboratory, of_rig)
+    imperfect = scene.imperfections != ImperfectionSettings()
+    scene = _with_bent_board(scene, of_rig) if imperfect else scene
     faults, disc, rate = scene.faults, true_disc_of(scene), true_frame_rate(scene)
     true_rig = cameras_with(faults, believed_rig.perturbed(error))
     believed_rig = replace(believed_rig, covariance=covariance, world_is_table=True)
     motion = motion or _rolling(scene, *rng.uniform(-3, 3, 2))
     times = faults.true_times(np.arange(n) / rate, rate) + STATION
     pixels = _exposed(motion, [times, times + faults.right_delay_s], faults, true_rig, disc)
-    if laboratory != Laboratory():
-        pixels = _shifted_dots(of_rig, pixels, scene.cameras.image_size, laboratory)
+    if imperfect:
+        pixels = _shifted_dots(of_rig, pixels, scene)
     pixels = pixels + sigma_px * rng.standard_normal(pixels.shape)
     dots = np.broadcast_to(sigma_px**2 * np.eye(2), (*pixels.shape, 2)).copy()
     q, declared = motion(times), scene.declared_disc
@@ -101,36 +121,31 @@ def measured(
     taken = Taken(range(n), declared_rate, scene.gravity_m_s2)
     good = np.zeros(pixels.shape[:-1], np.uint8)  # status of frames and dots
     found = trajectory_of(seen, fits, np.zeros((n, 6, 6)), status_of(good[:, 0, 0], fits), good, taken)
-    # with a bowed board, tracking determines the displacement of the table from the rim
-    return replace(found, table_moved=(laboratory.board_bow_m, laboratory.board_tilt, laboratory.board_tilt))
+    # with a bent board, tracking determines the displacement of the table from the rim
+    height, *tilts = (1e-3 * scene.imperfections.board_bow_mm * TABLE_BY_BOW).tolist()
+    return replace(found, table_moved=(height, *tilts))
 
 
-def _in_the_laboratory(scene: Scene, lab: Laboratory, rng: np.random.Generator) -> Scene:
-    """The scene with errors of the board and of the positions of the dots as faults."""
-    if lab == Laboratory():
-        return scene
-    height, scale, x, y = rng.standard_normal(4)
-    f, tilt = scene.faults, np.degrees(lab.board_tilt)
-    pattern_scale = f.pattern_scale + lab.board_scale * scale
-    # misprints are errors of the final position: the scale of the pattern is divided out
-    prints = 1e3 * lab.print_m * rng.standard_normal((scene.declared_disc.n_markers, 2)) / pattern_scale
-    faults = replace(
-        f,
-        misprint_mm=tuple(map(tuple, prints + (f.misprint_mm or 0.0))),
-        table_height_mm=f.table_height_mm + 1e3 * lab.board_bow_m * height,
-        table_turn_deg=(f.table_turn_deg[0] + tilt * x, f.table_turn_deg[1] + tilt * y),
-        pattern_scale=pattern_scale,
-    )
-    return replace(scene, faults=faults)
+def _with_bent_board(scene: Scene, rng: np.random.Generator) -> Scene:
+    """The scene with random errors of table and scale as faults, as large as bow and stretch of its board allow."""
+    height, scale, *tilts = rng.standard_normal(4)
+    settings, f = scene.imperfections, scene.faults
+    lifted, *turned = settings.board_bow_mm * TABLE_BY_BOW * [height, *tilts]
+    changed = {
+        "table_height_mm": f.table_height_mm + lifted,
+        "table_turn_deg": tuple(f.table_turn_deg + np.degrees(1e-3 * np.array(turned))),
+        "pattern_scale": f.pattern_scale + settings.board_stretch / 2 * scale,  # of two sides one is stretched
+    }
+    return scene.changed(faults=changed)
 
 
-def _shifted_dots(rng: np.random.Generator, pixels: Array, size: tuple[int, int], laboratory: Laboratory) -> Array:
-    """Centres (n, 2, m, 2) with the errors of lens and glare."""
-    found = pixels.copy()
+def _shifted_dots(rng: np.random.Generator, pixels: Array, scene: Scene) -> Array:
+    """Centres (n, 2, m, 2) with a field of each lens, and a smaller one of each dot: glare, gradients of light."""
+    found, size, lens_px = pixels.copy(), scene.cameras.image_size, scene.imperfections.lens_field_px
     for camera in range(2):
-        found[:, camera] += smooth_field(rng, size, laboratory.lens_px)(pixels[:, camera])
+        found[:, camera] += smooth_field(rng, size, lens_px)(pixels[:, camera])
         for dot in range(pixels.shape[2]):
-            found[:, camera, dot] += smooth_field(rng, size, laboratory.glare_px)(pixels[:, camera, dot])
+            found[:, camera, dot] += smooth_field(rng, size, lens_px / 5)(pixels[:, camera, dot])
     return found
 
 

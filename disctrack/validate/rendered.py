@@ -5,9 +5,11 @@ the recording are those of any user's recording. A comparison uses only the trut
 """
 
 import tempfile
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,16 +18,17 @@ from calibration.kit.arrays import Array
 from disctrack.calibrate.stage import calibrate_recording
 from disctrack.disc import Disc
 from disctrack.errors import SceneError
+from disctrack.findings import Kind
 from disctrack.frames import CAMERAS, rotation_from_euler
-from disctrack.recording.declaration import Recording, read_recording
+from disctrack.recording.declaration import read_recording
 from disctrack.synthetic.cameras import all_inside, rig_of
 from disctrack.synthetic.description import GlareSettings, Scene
 from disctrack.synthetic.recording import Truth, write_recording
-from disctrack.track.follow.tracking import Measurement, Taken, track
-from disctrack.track.measurement import open_pairs
+from disctrack.track.measurement import measure, open_pairs
 from disctrack.track.pose import MIN_DOTS
 from disctrack.trajectory import part
 from disctrack.validate.errors import PoseErrors, compare
+from disctrack.validate.points import LABORATORY
 
 STATIC = "static poses"
 ROLLING = "rolling at 8 to 12 deg"
@@ -47,7 +50,6 @@ class RenderedOutcome:
 
     name: str
     seed: int
-    corners_px: float  # rms residual of the calibration
     own: PoseErrors
     true: PoseErrors
     cameras: NDArray[np.int64]  # (n,) that see the upper face
@@ -112,18 +114,10 @@ def imperfect_case(scene: Scene, frames: int) -> Scene:
         GlareSettings(name, (rng.uniform(0.3, 0.7) * width, rng.uniform(0.3, 0.7) * height), 0.18 * width, 12.0)
         for name in CAMERAS
     )
-    scene = scene.changed(
-        imperfections={
-            "lens_field_px": 0.02,
-            "board_bow_mm": 0.06 if scene.seed % 2 else -0.06,
-            "board_stretch": 2e-4,
-            "pixel_gain": 0.01,
-            "column_offset_dn": 0.3,
-            "response_curve": 0.03,
-        },
-        optics={"vignetting": 0.15},
-        light={"glare": spots},
-    )
+    usual = LABORATORY["imperfections"]
+    sensor = {"pixel_gain": 0.01, "column_offset_dn": 0.3, "response_curve": 0.03}
+    flaws = {**usual, **sensor, "board_bow_mm": usual["board_bow_mm"] * (1 if scene.seed % 2 else -1)}
+    scene = scene.changed(imperfections=flaws, optics={"vignetting": 0.15}, light={"glare": spots})
     return rolling_scene(scene, IMPERFECT, rng.uniform(8, 16), frames, rng)
 
 
@@ -146,19 +140,14 @@ def render_and_measure(scene: Scene) -> RenderedOutcome:
         truth = render(Path(folder) / "recording", scene)
         recording = read_recording(Path(folder) / "recording")
         calibration, _ = calibrate_recording(recording)
-        found = [locate(recording, rig) for rig in (calibration.rig, truth.rig)]
+        found = [measure(recording, rig, open_pairs(recording)) for rig in (calibration.rig, truth.rig)]
     rows = slice(None, None, 2 if scene.motion.kind == "static" else 1)
     own, true = (compare(part(tracking.trajectory, rows), truth.q) for tracking in found)
-    return RenderedOutcome(
-        scene.name,
-        scene.seed,
-        calibration.rms_px,
-        own,
-        true,
-        cameras_in_sight(truth.q, truth.rig, recording.disc),
-        tuple(found[0].details["systematic_px"]),
-        tuple(finding.sentence for finding in found[0].trajectory.findings),
-    )
+    cameras = cameras_in_sight(truth.q, truth.rig, recording.disc)
+    systematic_px = tuple(found[0].details["systematic_px"])
+    # the empty pairs are no warning
+    warnings = tuple(f.sentence for f in found[0].trajectory.findings if f.kind != Kind.UNREADABLE)
+    return RenderedOutcome(scene.name, scene.seed, own, true, cameras, systematic_px, warnings)
 
 
 def render(folder: Path, scene: Scene) -> Truth:
@@ -166,16 +155,19 @@ def render(folder: Path, scene: Scene) -> Truth:
     truth = write_recording(folder, scene)
     if scene.motion.kind == "static":
         for camera in CAMERAS:
-            for number, file in reversed([*enumerate(sorted((folder / camera).iterdir()))]):
-                file.rename(file.with_name(f"{2 * number:06d}.png"))
-                file.with_name(f"{2 * number + 1:06d}.png").touch()
+            reordered(folder / camera, lambda files: [content for file in files for content in (file, b"")])
     return truth
 
 
-def locate(recording: Recording, rig: StereoRig) -> Measurement:
-    """Measure the disc in all pairs with these cameras."""
-    pairs = open_pairs(recording)
-    return track(pairs.reading({}), Taken(range(len(pairs)), recording.frame_rate), rig, recording.disc)
+def reordered(folder: Path, change: Callable[[list[bytes]], Iterable[bytes | NDArray]]) -> None:
+    """Reorder, remove, repeat or change the files of a folder, and renumber them; images are encoded as before."""
+    files = sorted(folder.iterdir())
+    contents = [*change([file.read_bytes() for file in files])]
+    for file in files:
+        file.unlink()  # it may be a link to a file of another recording
+    for number, content in enumerate(contents):
+        encoded = content if isinstance(content, bytes) else cv2.imencode(files[0].suffix, content)[1].tobytes()
+        (folder / f"{number:06d}{files[0].suffix}").write_bytes(encoded)
 
 
 def static_poses(n: int, scene: Scene, rng: np.random.Generator) -> Array:

@@ -1,29 +1,31 @@
-"""The result of a validation, and its output as Markdown, as JSON and as a section of a page."""
+"""The result of a validation, and its output as JSON and as section of a Markdown page."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from datetime import date
 from multiprocessing import get_context
 from pathlib import Path
-from time import perf_counter
 from typing import TypeVar
 
 import numpy as np
+from tqdm import tqdm
 
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file
 from disctrack.files.software import __version__
-from disctrack.files.whole import make_folder, write_whole
+from disctrack.files.whole import write_whole
 
 Case = TypeVar("Case")
 Outcome = TypeVar("Outcome")
+Key = TypeVar("Key")
 
 
-def table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]], note: str = "", form: str = ".3g") -> str:
+def table(title: str, of: str, rows: Mapping[str, Mapping[str, object]], note: str = "", form: str = ".3g") -> str:
     """Markdown table of text and numbers with a title above and a note below.
 
-    form : format of floats; a dash replaces those that are not finite
+    rows : cells by the heads of their columns, by the name of what they are `of`
+    form : format of floats; a dash replaces those that are missing or not finite
     """
 
     def text(cell: object) -> str:
@@ -31,9 +33,11 @@ def table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]], not
             return format(cell, form) if np.isfinite(cell) else "-"
         return str(cell)
 
-    lines = [head, ["---"] * len(head), *(map(text, row) for row in rows)]
+    heads = dict.fromkeys(head for row in rows.values() for head in row)
+    cells = [[name, *(text(row.get(head, np.nan)) for head in heads)] for name, row in rows.items()]
+    lines = [[of, *heads], ["---"] * (1 + len(heads)), *cells]
     shown = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    return f"## {title}\n\n{shown}\n" + (f"\n{note}\n" if note else "")
+    return f"### {title}\n\n{shown}\n" + (f"\n{note}\n" if note else "")
 
 
 @dataclass(frozen=True)
@@ -53,31 +57,34 @@ class Validation:
         return "\n".join([f"{self.headline}\n", *lists, *self.tables])
 
 
-def measure_all(
-    measure: Callable[[Case], Outcome], cases: Sequence[Case], processes: int, say: Callable[[str], object]
-) -> list[Outcome]:
-    """Outcomes in the order of the cases; `say` gets messages on the progress."""
-    began, outcomes = perf_counter(), []
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        for outcome in map(measure, cases) if processes == 1 else pool.map(measure, cases):
-            outcomes.append(outcome)
-            say(f"{perf_counter() - began:6.0f} s  {len(outcomes)} of {len(cases)} recordings")
-    return outcomes
+def grouped(outcomes: Iterable[Outcome], key: Callable[[Outcome], Key]) -> dict[Key, list[Outcome]]:
+    """Outcomes with the same key, in the order of their first."""
+    groups: dict[Key, list[Outcome]] = {}
+    for outcome in outcomes:
+        groups.setdefault(key(outcome), []).append(outcome)
+    return groups
 
 
-def write_validation(folder: Path, validation: Validation) -> list[Path]:
-    """Write NAME.md and NAME.json; returns the files. Raises OutputError."""
-    make_folder(folder)
-    files = [folder / f"{validation.name}.md", folder / f"{validation.name}.json"]
-    write_whole(files[0], validation.markdown().encode())
+def measure_all(measure: Callable[[Case], Outcome], cases: Sequence[Case], jobs: int, quiet: bool) -> list[Outcome]:
+    """Outcomes in the order of the cases, with a progress bar."""
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        outcomes = map(measure, cases) if jobs == 1 else pool.map(measure, cases)
+        return list(tqdm(outcomes, "validate", len(cases), unit=" recordings", disable=quiet))
+
+
+def write_validation(folder: Path, validation: Validation, command: str, page: Path | None = None) -> list[Path]:
+    """Write NAME.md, NAME.json and, if given, the section of a page; returns the files. Raises OutputError."""
+    numbers = folder / f"{validation.name}.json"
+    pages = [folder / f"{validation.name}.md", *([page] if page else [])]
+    for file in pages:
+        _write_section(file, validation, command)
     tree = {"units": "SI, radians unless named", "headline": validation.headline, "complaints": validation.complaints}
-    outcomes = [vars(outcome) for outcome in validation.outcomes]
-    write_whole(files[1], json_file(tree | {"outcomes": outcomes}))
-    return files
+    write_whole(numbers, json_file(tree | {"outcomes": [vars(outcome) for outcome in validation.outcomes]}))
+    return [*pages, numbers]
 
 
-def write_into(page: Path, validation: Validation, command: str) -> None:
-    """Write the tables, with date, version and command, between the page's marks of this validation, or at its end."""
+def _write_section(page: Path, validation: Validation, command: str) -> None:
+    """Write a section, with date, version and command, between the marks of this validation, or at the page's end."""
     begin, end = f"<!-- validation: {validation.name} -->", f"<!-- end of {validation.name} -->"
     text = page.read_text(encoding="utf-8") if page.exists() else ""
     before, begun, rest = text.partition(begin)
@@ -85,5 +92,5 @@ def write_into(page: Path, validation: Validation, command: str) -> None:
     if begun and not ended:
         raise OutputError(f"{page}: '{begin}' without '{end}' below; expected both, or neither for a new section")
     source = f"Written by `{command}`, disctrack {__version__}, {date.today().isoformat()}."
-    tables = "\n".join(f"#{table}" for table in validation.tables)  # under a heading of the page
-    write_whole(page, f"{before}{begin}\n{validation.headline}\n\n{tables}\n{source}\n{end}{after or chr(10)}".encode())
+    content = f"{before}{begin}\n{validation.markdown()}\n{source}\n{end}{after or chr(10)}"
+    write_whole(page, content.encode())

@@ -25,14 +25,14 @@ def measured(
     rig_seed : of the errors of calibration and laboratory, equal for recordings of one day
     """
     model = Model(Scene().declared_disc, laws=tuple(laws)).with_values({"km.k_m": k_m} | dict(effects or {}))
-    disc = other.pop("disc", {})  # what differs from the usual one in the scene's section
-    of_points = {name: other.pop(name) for name in ("laboratory", "motion", "sigma_px") if name in other}
+    sections = {"disc": other.pop("disc", {})} | other.pop("laboratory", {})  # what differs from the scene's usual ones
+    of_points = {name: other.pop(name) for name in ("motion", "sigma_px") if name in other}
     start = {"theta_deg": 14.0, "nutation_deg": 0.5, "omega3_rad_s": other.pop("omega3", 1.0)} | other
     formulas = {law.name: law.formulas for law in laws}
     rolling = start | {"effects": {e.name: e.values for e in model.effects}, "formulas": formulas}
     motion, cameras = {"kind": "rolling", "rolling": rolling}, {"frame_rate_hz": declared_rate, "n_frames": n}
     day, noise = (seed, None) if rig_seed is None else (rig_seed, seed)
-    scene = Scene(seed=day, faults=faults or Faults()).changed(cameras=cameras, motion=motion, disc=disc)
+    scene = Scene(seed=day, faults=faults or Faults()).changed(cameras=cameras, motion=motion, **sections)
     return points.measured(scene, noise_seed=noise, **of_points)
 
 

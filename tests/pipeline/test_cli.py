@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -22,7 +23,7 @@ from disctrack import FrameStatus, open_pairs, read_trajectory
 from disctrack.cli import COMMANDS, main
 from disctrack.disc import MA_2014
 from disctrack.synthetic.description import Scene, load_scene
-from disctrack.validate.planted_faults import redrawn
+from disctrack.validate.planted_faults import redrawn, reordered
 from tests.pipeline.conftest import QUICK, contents, edit, linked
 
 
@@ -211,7 +212,7 @@ def failure(cli, *words) -> str:
 
 def change_images(recording: Path, change, cameras=("left", "right")) -> None:
     for camera in cameras:
-        redrawn(recording / camera, lambda image, share: change(image))
+        reordered(recording / camera, partial(redrawn, change=lambda image, share: change(image)))
 
 
 def in_colour(image: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ import os
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -41,7 +42,7 @@ def planted(name: str, size: float) -> Plant:
 
 def drawn(change, cameras=CAMERAS) -> Plant:
     """Other images; change(image, share of the recording before it)."""
-    return lambda folder, tree: [redrawn(folder / camera, change) for camera in cameras]
+    return lambda folder, tree: [reordered(folder / camera, partial(redrawn, change=change)) for camera in cameras]
 
 
 def late(by: int, ahead: str, behind: str) -> Plant:
@@ -94,7 +95,7 @@ def trembling(folder, tree):
             spectrum = fourier_shift(np.fft.fft2(image), shifts[round(share * 300)][::-1])
             return np.fft.ifft2(spectrum).real.round().clip(0, 255).astype(np.uint8)
 
-        redrawn(folder / camera, shaken)
+        reordered(folder / camera, partial(redrawn, change=shaken))
 
 
 def grey(image):

@@ -22,7 +22,7 @@ from disctrack.faults.keys import CameraFault, Faults
 from disctrack.rolling import Model, Regime, State, simulate, steady_precession
 from disctrack.synthetic.description import Scene
 from disctrack.trajectory import MarkerStatus, Trajectory
-from disctrack.validate.points import ORDINARY, Laboratory
+from disctrack.validate.points import LABORATORY
 from tests.oracles.linear_system import Linear, one
 from tests.oracles.measured_disc import K_M, assert_sized, measured, system_of
 
@@ -212,7 +212,7 @@ def test_a_disc_without_a_motion_is_an_error_that_says_what_it_does():
         free_stretch(measured(seed=53, n=30))
 
 
-def recording(effects=None, *, laboratory=ORDINARY, faults=None, seed=1, n=300):
+def recording(effects=None, *, laboratory=LABORATORY, faults=None, seed=1, n=300):
     """As a tracking states it whose covariances cover all that the dots show."""
     trajectory = measured(
         effects, faults=faults, laboratory=laboratory, seed=seed, n=n, declared_rate=500.0, theta_deg=9.0
@@ -239,7 +239,7 @@ def test_the_noise_is_what_changes_from_frame_to_frame():
 def test_a_camera_that_turned_does_not_make_the_motion_look_like_rest():
     """0.07 deg, 2.5 px: covariances that cover it are larger than what the disc moves in a frame."""
     turned = Faults(right=CameraFault(rotation_deg=(0.04, 0.05, 0.02)))
-    trajectory, inflated = recording(laboratory=Laboratory(), faults=turned, n=120)
+    trajectory, inflated = recording(laboratory={}, faults=turned, n=120)
     assert inflated > 1e4
     measured_rows = np.flatnonzero(trajectory.measured)
     assert at_rest(trajectory, measured_rows).all()
@@ -252,7 +252,7 @@ def test_fields_are_sized_from_the_dots_alone_and_faults_are_no_fields():
     assert found.left == pytest.approx(1.0, abs=0.1)  # 200 frames of 18 numbers: 2 %, and what bumps miss
     assert 0.008 < found.lens_px < 0.05  # 0.02 px over the whole image; the dots see a part of it
     assert found.faults_px == 0.0
-    alone = systematic_of(recording(laboratory=Laboratory(), faults=Faults(right_delay_s=2e-4))[0])
+    alone = systematic_of(recording(laboratory={}, faults=Faults(right_delay_s=2e-4))[0])
     assert (alone.present, alone.faults_px > 0.03) == (False, True)  # 0.2 ms, in which dots move by a tenth of a pixel
     both = systematic_of(recording(faults=Faults(right_delay_s=2e-4))[0])
     assert both.lens_px > 0.008

@@ -9,22 +9,22 @@ from disctrack.diagnosis import DiscSystem
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
 from disctrack.errors import DiscTrackError
-from disctrack.validate.diagnoses import Verdict, diagnosis_validation, what_was_wrong
-from disctrack.validate.hidden import INVISIBLE, HiddenCase, alike, draw, hidden_cases, plant, sizes
-from disctrack.validate.points import measured
+from disctrack.validate import hidden
+from disctrack.validate.hidden import HiddenCase, Verdict, hidden_cases, plant, sizes
+from disctrack.validate.points import drawn, measured
 from tests.oracles.measured_disc import assert_sized
 
 
 def visible(name):
     """Faults of the measurement are planted in another way than predicted: by renderer, instants, frames, areas."""
-    return name if alike(name)[0].kind == "measurement" else pytest.param(name, marks=pytest.mark.slow)
+    return name if hidden.candidates()[name][0].kind == "measurement" else pytest.param(name, marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize("name", [visible(name) for name in sizes() if name not in INVISIBLE])
+@pytest.mark.parametrize("name", [visible(name) for name in sizes() if name not in hidden.INVISIBLE])
 def test_a_planted_effect_is_what_the_diagnosis_calls_by_that_name(name):
     """Fitted alone, it comes out at the planted size within its sigma, and leaves noise."""
     truth, planted = plant(name, sizes()[name], np.random.default_rng(7))
-    scene = draw(5, planted)
+    scene = drawn(5, planted)
     trajectory = measured(scene.changed(cameras={"n_frames": 150}))
     system = DiscSystem(trajectory, declared_model(trajectory)[0])
     candidate = next(c for c in system.candidates if set(truth) <= set(c.names))
@@ -46,7 +46,7 @@ def test_a_verdict_tells_what_became_of_the_hidden_effect():
     assert verdict.extra == 0
     assert verdict.free_run[0] > 1.2
     assert verdict.can_be_told
-    assert what_was_wrong(verdict) == ""
+    assert hidden.what_was_wrong(verdict) == ""
     # by itself it gains what it stands out by; scatter of a normal number
     assert verdict.stands_out == pytest.approx(np.sqrt(verdict.gain), abs=4)
     # and of the size that it is found from it gains what a claim takes, within the same scatter
@@ -69,24 +69,24 @@ def test_an_effect_below_its_sigma_is_not_asked_for():
 def test_nothing_is_found_where_nothing_is_hidden_and_the_table_says_so():
     verdict = Verdict(HiddenCase({"nothing": 1.0}, seed=4))
     assert verdict.verdict == "nothing missing"
-    assert verdict.found == ()
-    validation = diagnosis_validation([verdict])
+    assert verdict.found == []
+    validation = hidden.diagnosis_validation([verdict])
     assert validation.headline == "Something claimed in 0 of 1 recordings in which nothing is hidden."
     assert 0 < verdict.p_value < 1
     assert f"{verdict.p_value < 0.5:d} of 1 |" in validation.markdown()
 
 
 def test_cases_are_told_by_name_and_size_and_pairs_are_drawn_anew_for_each_seed():
-    assert len(list(hidden_cases([], range(1, 3)))) == 102
+    assert len(hidden_cases([], range(1, 3))) == 102
     (case,) = hidden_cases(["kz=1e-7"], [5])
     assert (dict(case.hidden), case.seed) == ({"kz": 1e-7}, 5)
     first, second = hidden_cases([], [7], pairs=2)
     assert (len(first.hidden), first.seed, second.seed) == (2, 7, 8)
     assert first.hidden.keys() != second.hidden.keys()
     with pytest.raises(DiscTrackError, match="there is no effect 'kx' to hide"):
-        list(hidden_cases(["kx"], [1]))
+        hidden_cases(["kx"], [1])
     with pytest.raises(DiscTrackError, match="size in m"):
-        list(hidden_cases(["kz=much"], [1]))
+        hidden_cases(["kz=much"], [1])
 
 
 @pytest.mark.slow
