@@ -70,6 +70,7 @@ class Planting:
     unit: str
     change: Change
     named_by: tuple[Kind, ...]
+    of_views: bool = False  # the recording is calibrated again with its own views
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,8 @@ def plant_and_run(case: FaultCase) -> FaultOutcome:
         folder = Path(place, fault)
         shutil.copytree(ground.recording, folder, ignore=shutil.ignore_patterns("results"))
         tree = dict(read_recording(folder).declared)
+        if not planting.of_views:
+            tree["calibration"] = {"rig": str(ground.recording / "results" / "rig.h5")}
         q = planting.change(folder, tree, size)
         declare(folder, tree)
         code, findings, trajectory = _run(folder)
@@ -166,12 +169,11 @@ def _in_sigmas(trajectory: Trajectory, q: Array) -> float:
 def plantings(ground: Ground) -> dict[str, Planting]:
     """All faults that can be planted into such a recording, by name; of those of each camera or dot, only one."""
     scene, recording, found = ground.scene, read_recording(ground.recording), {}
-    rig = ground.recording / "results" / "rig.h5"
     for fault in FAULTS:
         one = [*each_of(fault, recording.disc.n_markers)][-1 if scene and fault.each == "camera" else 0]
         declarable = not fault.in_images and fault.key != "right_delay_s"  # equivalent to a wrong declaration
         if fault.named_by and (scene or declarable):
-            change: Change = partial(_rendered, one, rig, scene) if scene else partial(_declared_wrong, one, rig)
+            change: Change = partial(_rendered, one, scene) if scene else partial(_declared_wrong, one)
             sizes = [TYPICAL_STEPS * fault.step * size for size in SIZES]
             if fault.in_images:  # the square of an exposure, which is shorter than the period
                 sizes = [size for size in sizes if size * recording.frame_rate**2 < 1]
@@ -185,22 +187,22 @@ def _with(fault: Fault, size: float, rate: float = 1.0) -> Faults:
     return fault.to_scene(Faults(), np.full(n, size / np.sqrt(n)), rate)
 
 
-def _rendered(fault: Fault, rig: Path, scene: Scene, folder: Path, tree: Tree, size: float) -> Array:
-    """Render the scene with the fault, which is not seen by the calibration."""
+def _rendered(fault: Fault, scene: Scene, folder: Path, tree: Tree, size: float) -> Array:
+    """Render the scene with the fault."""
     wrong = _with(fault, size, scene.cameras.frame_rate_hz)
-    tree["calibration"] = {"rig": str(rig)}
     shutil.rmtree(folder)
     return write_recording(folder, scene.changed(faults=wrong, board={"n_views": 1})).q
 
 
-def _declared_wrong(fault: Fault, rig: Path, folder: Path, tree: Tree, size: float) -> None:
+def _declared_wrong(fault: Fault, folder: Path, tree: Tree, size: float) -> None:
     """Change the declaration and the rig so that the unchanged images have the fault."""
     wrong, disc = _with(fault, -size), read_recording(folder).disc
+    rig = cameras_with(wrong, read_rig(tree["calibration"]["rig"]))
     tree["markers"]["centres_mm"] = (1e3 * centres_with(wrong, disc)[:, :2]).tolist()
     tree["disc"]["thickness_mm"] = 2e3 * float(disc.half_thickness + 1e-3 * wrong.pattern_height_mm)
     tree["cameras"]["frame_rate_hz"] *= wrong.frame_rate_hz or 1.0
     tree["calibration"] = {"rig": str(folder / "rig.h5")}
-    write_rig(folder / "rig.h5", cameras_with(wrong, read_rig(rig)))
+    write_rig(folder / "rig.h5", rig)
 
 
 def declare(folder: Path, tree: Tree) -> None:
@@ -291,13 +293,13 @@ def _wrong(section: str, key: str, *kinds: Kind, smallest: float = 3e-3) -> Plan
                 del part[tolerance]
         tree[section][key] *= 1 + size
 
-    return Planting([smallest * size for size in (1, 10, 100)], "1", change, kinds)
+    return Planting([smallest * size for size in (1, 10, 100)], "1", change, kinds, section == "calibration")
 
 
 _LOST = (Kind.DROPPED_FRAMES, Kind.DELAY, Kind.ONE_SIDED)
 _REPEATED = (Kind.REPEATED_IMAGES,)
 _VIEWS = ("calibration/left", "calibration/right")
-_of_views = partial(Planting, named_by=(Kind.CALIBRATION,))
+_of_views = partial(Planting, named_by=(Kind.CALIBRATION,), of_views=True)
 CHANGES = {
     "pairs lost by both": Planting((1, 3, 10), "pairs", _files(left=_lost, right=_lost), (Kind.CLOCK_JUMP,)),
     "images lost by one": Planting((1, 3, 10, 20), "images", _files(left=_last_lost, right=_lost), _LOST),

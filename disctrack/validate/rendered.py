@@ -191,9 +191,7 @@ def _pose(stratum: Array, rig: StereoRig, disc: Disc, middle: Array, rng: np.ran
         q = np.array([x, y, disc.resting_height(theta), psi, theta, phi])
         if all_inside(disc.marker_centres_body @ rotation_from_euler(*q[3:]).T + q[:3], rig, BORDER_PX):
             return q
-    raise SceneError(
-        "validation: no place found where all dots lie in both images; widen the field (rig.mm_per_px, image_size)"
-    )
+    raise SceneError("no place found where all dots lie in both images; widen the field (rig.mm_per_px, image_size)")
 
 
 def cameras_in_sight(q: Array, rig: StereoRig, disc: Disc) -> NDArray[np.int64]:

@@ -73,14 +73,14 @@ def measure_all(measure: Callable[[Case], Outcome], cases: Sequence[Case], jobs:
 
 
 def write_validation(folder: Path, validation: Validation, command: str, page: Path | None = None) -> list[Path]:
-    """Write NAME.md, NAME.json and, if given, the section of a page; returns the files. Raises OutputError."""
+    """Write NAME.json, NAME.md and, if given, the section of a page; returns the files. Raises OutputError."""
     numbers = folder / f"{validation.name}.json"
+    tree = {"units": "SI, radians unless named", "headline": validation.headline, "complaints": validation.complaints}
+    write_whole(numbers, json_file(tree | {"outcomes": [vars(outcome) for outcome in validation.outcomes]}))
     pages = [folder / f"{validation.name}.md", *([page] if page else [])]
     for file in pages:
         _write_section(file, validation, command)
-    tree = {"units": "SI, radians unless named", "headline": validation.headline, "complaints": validation.complaints}
-    write_whole(numbers, json_file(tree | {"outcomes": [vars(outcome) for outcome in validation.outcomes]}))
-    return [*pages, numbers]
+    return [numbers, *pages]
 
 
 def _write_section(page: Path, validation: Validation, command: str) -> None:

@@ -81,7 +81,7 @@ def test_files_are_whole_and_a_page_keeps_what_stands_around_the_tables(outcomes
     marked = "<!-- validation: validation -->\nformer table\n<!-- end of validation -->"
     page.write_text(f"# Accuracy\n\n{marked}\n\nLast words.\n")
     for _ in range(2):  # writing it once more changes nothing
-        text, _, numbers = write_validation(tmp_path, validation, "disctrack validate", page)
+        numbers, text, _ = write_validation(tmp_path, validation, "disctrack validate", page)
     tree = json.loads(numbers.read_text())
     assert tree["headline"] == validation.headline
     assert {"2", "1", "0"} < set(tree["outcomes"][0]["sights"])
