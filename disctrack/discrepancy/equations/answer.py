@@ -15,6 +15,7 @@ from calibration.kit.arrays import Array
 from calibration.kit.threads import one_blas_thread
 from disctrack.discrepancy.document import document, effect_text, tables
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
+from disctrack.discrepancy.equations.extent import Extent
 from disctrack.discrepancy.equations.forecast import Forecast, RunScore, free_run, scored
 from disctrack.discrepancy.equations.law import NAME, LearnedForce
 from disctrack.discrepancy.equations.loop import find_missing
@@ -22,6 +23,7 @@ from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.noise import OUTLIER, outlier_limit
 from disctrack.discrepancy.search import Diagnosis, Settings, Verdict
+from disctrack.discrepancy.shape import WORTH_A_SHAPE
 from disctrack.discrepancy.significance import whiteness
 from disctrack.discrepancy.system import Candidate, System
 from disctrack.errors import OutputError
@@ -72,6 +74,7 @@ class Answer:
     autocorrelated: bool  # is that noise autocorrelated?
     remarks: tuple[str, ...]  # of the search
     law: LearnedForce | None  # a learned law; None where none describes the data
+    holds: Extent | None  # of a single run that nothing explains: the parts in which the equations hold
 
     @property
     def verdict(self) -> Verdict:
@@ -112,9 +115,9 @@ class Answer:
 
     def _nearest_notes(self) -> list[str]:
         """Where no term is found: those that gain most, and their residuals."""
-        nearest, helpful = self.diagnosis.nearest, []
-        if nearest is None:
-            return []
+        nearest, helpful, d = self.diagnosis.nearest, list[str](), self.diagnosis
+        if nearest is None or nearest.fit.excess(d.noise) > (1 - WORTH_A_SHAPE) * d.before.excess(d.noise):
+            return []  # what leaves most of it describes nothing
         for c in nearest.candidates:
             numbers = ((q.part, self.nearest.get(q.name, q.null)) for q in (*c.quantities, *c.shape))
             sizes = ", ".join(f"{name} = {value:.4g}" for name, value in numbers)
@@ -296,9 +299,12 @@ class Answer:
         effects = "; and ".join(self._law_text(f.candidate) or effect_text(f, d) for f in d.found)
         if d.verdict == "found":
             return f"Missing: {effects}. With {'it' if len(d.found) == 1 else 'them'} the equations leave {level}."
+        where = f" {self.holds.text(self.equations.units)}" if self.holds else ""
         if effects:
-            return f"Something is missing that no term describes; the nearest is {effects}, which leaves {level}."
-        return f"Something is missing that no term describes: the equations leave {level}."
+            return (
+                f"Something is missing that no term describes; the nearest is {effects}, which leaves {level}.{where}"
+            )
+        return f"Something is missing that no term describes: the equations leave {level}.{where}"
 
     def _unit(self, name: str) -> str:
         return self.equations.units.get(name, "1")
@@ -332,6 +338,7 @@ class Answer:
             "runs": [{"name": s.name, "samples": len(s.time)} for s in self.system.stretches],
             "whiteness_p_value": self.whiteness,
             "law": None if self.law is None else self.law.document(),
+            "holds": None if self.holds is None else vars(self.holds),
         }
         return dict(plain(found))
 

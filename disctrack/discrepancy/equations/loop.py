@@ -10,6 +10,7 @@ from calibration.kit.arrays import Array
 from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations import terms as library
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
+from disctrack.discrepancy.equations.extent import Extent, extent
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, fitted_rows
@@ -44,12 +45,13 @@ USUAL_SHARE = 0.1  # of the rms of an equation: the typical size of a term
 
 def find_missing(
     equations: Equations, runs: Sequence[Run], terms: Sequence[Term] | None = None, settings: Settings | None = None
-) -> tuple[Diagnosis, EquationSystem, System, bool, tuple[str, ...], LearnedForce | None]:
+) -> tuple[Diagnosis, EquationSystem, System, bool, tuple[str, ...], LearnedForce | None, Extent | None]:
     """Fit the equations to the runs and search for what they lack.
 
     terms : None: the usual ones (`terms.usual`)
     returns : diagnosis, system in the stretches that were fitted, the same with its noise as estimated, whether that is
-        autocorrelated, remarks, and a learned law where one describes the data
+        autocorrelated, remarks, a learned law where one describes the data, and of a single run that is unexplained the
+        parts in which the equations hold
     """
     settings = settings or Settings(unexplained_share=NEARLY)
     given = checked(equations, runs)
@@ -75,7 +77,9 @@ def find_missing(
         reason = "the model follows less than a period of the motion, and has no term with which it follows more"
         diagnosis = replace(diagnosis, verdict="unexplained", reason=reason)
         notes.append(reason)
-    judged = diagnosis.judged or system
+    judged, holds = diagnosis.judged or system, None
+    if diagnosis.verdict == "unexplained" and len(given) == 1:
+        holds = extent(replace(system, stretches=whole.stretches), diagnosis)
     law = learn(system, diagnosis, channels, None if judged is system else judged)
     named = law is not None and law.is_named(diagnosis)
     notes += on_noise if autocorrelated or not (law and named and law.at_noise) else []
@@ -88,7 +92,7 @@ def find_missing(
     if system.held:
         held = ", ".join(system.held)
         notes.append(f"{held} cannot be distinguished from other numbers by these data: held as declared")
-    return diagnosis, system, judged, autocorrelated, tuple(notes), law
+    return diagnosis, system, judged, autocorrelated, tuple(notes), law, holds
 
 
 def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationSystem, Diagnosis, list[str]]:
