@@ -15,6 +15,8 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.search import Diagnosis, Found
 from disctrack.numbers import Measured, probability, rounded
 
+FEW = 3  # numbers of a law that a sentence holds; the page has them all
+
 
 @dataclass(frozen=True)
 class Learned(Found):
@@ -26,17 +28,22 @@ class Learned(Found):
     misfit: float  # rms of the discrepancy of the form over that of the law
 
     def text(self, fit: Fit) -> str:
-        """The law with its coefficients; if they are not significant, only its time course."""
+        """The law with its coefficients if they are few; else, or if they are not significant, its time course."""
         if self.course is not None and not self.law.is_significant(fit):
             return (
                 f"its form is not determined here: it is {self.course.text} (nearest of the library: {self.law.title})"
             )
-        quantities = self.candidate.quantities
-        numbers = ", ".join(f"{q.part} = {Measured(fit.values[q.name], fit.sigma(q.name))}" for q in quantities)
-        named = all(family.names for family in self.law.families)
-        formulas = "" if named else "; ".join(f"{c} = {formula}" for c, formula in self.law.formulas.items())
         angles = ", locked to the disc's angles" if locked(self.law) else ""
+        named = all(family.names for family in self.law.families)
+        if len(self.numbers(fit)) > FEW and not named:
+            return f"{self.law.title}{angles}{f': {self.course.text}' if self.course else ''}"
+        formulas = "" if named else "; ".join(f"{c} = {formula}" for c, formula in self.law.formulas.items())
+        numbers = ", ".join(f"{name} = {value}" for name, value in self.numbers(fit))
         return f"{self.law.title}: {formulas}{'' if named else ' with '}{numbers} (SI){angles}"
+
+    def numbers(self, fit: Fit) -> list[tuple[str, Measured]]:
+        """Its coefficients and shape parameters."""
+        return [(q.part, Measured(fit.values[q.name], fit.sigma(q.name))) for q in self.candidate.quantities]
 
 
 @dataclass(frozen=True, repr=False)

@@ -389,8 +389,7 @@ class _Search:
                 self.noise = min(self.noise, self._noise(best.fit))
             few = ranked[:1]
             if not self._at_noise(best.fit):  # several effects may be short only together
-                sizes = [[e for e in ranked if len(e.candidates) == n] for n in range(self.settings.max_effects + 1)]
-                few += [e for alike in sizes for e in alike[:WIDTH]]
+                few += self._shortest_of_each_number(ranked)
             new = next((e for e in few if e.names not in self.expanded), None)
             if new is None:
                 return
@@ -401,6 +400,20 @@ class _Search:
             if len(new.candidates) > 1:
                 for c in new.candidates:
                     self._refit_without(new, c)
+
+    def _shortest_of_each_number(self, ranked: Sequence[Explanation]) -> list[Explanation]:
+        """The shortest explanations of each number of effects, as long as one effect more describes much more.
+
+        Far from the data, a sum whose terms each remove a small part approximates any motion.
+        """
+        few, left = list[Explanation](), np.inf
+        for n in range(self.settings.max_effects + 1):
+            alike = [e for e in ranked if len(e.candidates) == n][:WIDTH]
+            before, left = left, min((e.fit.excess(self.noise) for e in alike), default=left)
+            if n > 1 and left > (1 - WORTH_A_SHAPE) * before:
+                break
+            few += alike
+        return few
 
     def _refit(self, e: Explanation, extra: tuple[Candidate, ...]) -> None:
         together = (*e.candidates, *extra)

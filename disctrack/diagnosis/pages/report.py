@@ -60,7 +60,7 @@ def report_of(
         [*findings, *of_kind(Kind.DIAGNOSIS, Severity.NOTE, notes)],
         blocks=[
             f"Verdict: {d.verdict}, because {d.reason}. Model: {MODELS.get(result.model, result.model)}.",
-            Section("Missing effects", [effects]),
+            Section("Missing effects", [effects, *_law(result)]),
             planned_section(result.plan),
             Section("Explanations that compete", [explanations_table(d)]),
             Section("Before and after" if result.has_more else "The model", _before_after(result, more)),
@@ -70,6 +70,14 @@ def report_of(
         files=files,
         page=files[0],
     )
+
+
+def _law(result: DiscDiagnosis) -> list[Listing]:
+    """Formulas and numbers of the law that was learned, as in model.toml."""
+    if (learned := result.learned) is None:
+        return []
+    rows: list[tuple[str, Cell]] = [*learned.law.formulas.items(), *learned.numbers(result.diagnosis.after)]
+    return [Listing(("", "law (SI; ± 1 σ)"), rows, folded="Formulas and numbers of the law")]
 
 
 def _before_after(result: DiscDiagnosis, more: Supplement | None) -> list[Listing | str]:

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 from disctrack.discrepancy.equations import Equations, Run, diagnose, terms
 from disctrack.discrepancy.search import Settings
 
+pytestmark = pytest.mark.statistical
 OSCILLATOR = Equations({"x": "v", "v": "-k*x - c*v"}, {"k": 8.5, "c": 0.1}, units={"x": "m"})
 OFFERED = [terms.quadratic("v")]
 TIME = np.linspace(0, 12, 1200)
@@ -32,7 +33,7 @@ def asked(rng, x):
     )
 
 
-@pytest.mark.parametrize(("blow", "instant"), [pytest.param(0.4, 4.0, marks=pytest.mark.statistical), (-0.15, 9.6)])
+@pytest.mark.parametrize(("blow", "instant"), [(0.4, 4.0), (-0.15, 9.6)])
 def test_a_blow_is_told_by_its_instant_and_by_how_much_the_velocity_changed(rng, blow, instant):
     row = int(np.searchsorted(TIME, instant))
     first = swinging(lambda t, x, v: 0.0, [0.5, 0.0], TIME[: row + 1])
@@ -49,7 +50,6 @@ def test_a_blow_is_told_by_its_instant_and_by_how_much_the_velocity_changed(rng,
     assert f"until {holds.until:.5g} s and from {holds.since:.5g} s on; in between" in answer.sentence
 
 
-@pytest.mark.statistical
 def test_after_a_drag_that_sets_in_nothing_is_said_of_states_that_changed(rng):
     x = swinging(lambda t, x, v: -3.0 * v * (t > 7.0), [0.5, 0.0], TIME)[0]
     holds = asked(rng, x).holds
@@ -57,7 +57,6 @@ def test_after_a_drag_that_sets_in_nothing_is_said_of_states_that_changed(rng):
     assert not holds.changes
 
 
-@pytest.mark.statistical
 def test_where_something_acts_all_the_time_the_equations_hold_nowhere(rng):
     answer = asked(rng, swinging(lambda t, x, v: -3.0 * x * np.sin(1.7 * t), [0.5, 0.0], TIME)[0])
     assert answer.verdict == "unexplained"
