@@ -204,8 +204,8 @@ def calibrate_from_corners(
     _require_table(table_view, dict.fromkeys(pairs.apart, "".join(apart[:1])) | not_used)
     _require_fitted(refinement, chain(*_not_used(views, names).values()), wide)
     shape = board_shape(refinement, board.points, refinement.inflation)
-    moved = None if refinement.problem.motion else motion_between_exposures(refinement)
-    covariance = stereo_covariance(refinement, moved and moved[1])
+    common = None if refinement.problem.motion else motion_between_exposures(refinement)[1]
+    covariance = stereo_covariance(refinement, common)
     rig = rig_with_covariance(refinement, table_view, board_thickness, refinement.inflation, covariance, shape.origin)
     with_board = with_tolerances(rig, board.points, board_thickness, tolerances, shape)
     assessment = assess(refinement, rig, with_board, motion, wide)
@@ -331,17 +331,16 @@ def _fit_jointly(
             observations = observations[(observations.view != view) | (observations.camera != camera)]
         used = pairs
         refinement = refined(used)
-    found, corrected = motion_between_exposures(refinement), fit_lens_field(refinement)
-    motion = found and found[0]
-    likely = motion is not None and motion.is_likely
-    if found is not None and motion is not None and likely and corrected.lens_field is not None:
+    (motion, _), corrected = motion_between_exposures(refinement), fit_lens_field(refinement)
+    if motion is None or not motion.is_likely:
+        return corrected, pairs, motion
+    if corrected.lens_field is not None:
         # an (incomplete) lens field moves boards differently in each camera, too: use the scatter before it
-        left, _ = motion_between_exposures(corrected) or found
+        left = motion_between_exposures(corrected)[0] or motion
         motion = replace(left, scatter=max(motion.scatter, left.scatter))
-        likely = motion.is_seen
-    if motion is not None and likely:
-        corrected = fit_lens_field(refined(used, motion.as_random(nominal)))
-    return corrected, pairs, motion
+        if not motion.is_seen:
+            return corrected, pairs, motion
+    return fit_lens_field(refined(used, motion.as_random(nominal))), pairs, motion
 
 
 def _require_table(table_view: int | None, unusable: Mapping[int, str]) -> None:
