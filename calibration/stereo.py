@@ -391,8 +391,6 @@ def _used_alone(views: Views, names: Names) -> list[str]:
 def _require_views(views: Views, names: Names, table_view: int | None) -> None:
     if table_view is not None and not 0 <= table_view < len(names):
         raise CalibrationError(f"table view {table_view} does not exist: there are views 0 to {len(names) - 1}")
-    if not views[0]:
-        raise CalibrationError("no calibration views were given")
     for camera, side in enumerate(views):
         found = sum(isinstance(view, CornerView) for view in side)
         if found < MIN_VIEWS:

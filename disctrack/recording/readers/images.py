@@ -52,7 +52,6 @@ def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameR
     whole, first = first_readable(len(files), camera, looked_at)
     alike = f"images are stored with {whole.shape[-1]} channels of equal value; one is used, without loss"
     return FrameReader(
-        camera=camera,
         files=[file or f"missing file of {camera} frame {index}" for index, file in enumerate(slots)],
         numbers=numbers,
         image_size=(first.shape[1], first.shape[0]),
@@ -85,7 +84,7 @@ def _open_stack(files: Sequence[Path], camera: str) -> FrameReader:
     first = pages[0]
     rate, stamps = _times(first.description, len(pages))
     check_frame_size(first.plain.width, first.plain.height, str(files[0]))
-    common: dict[str, Any] = {"camera": camera, "files": [page.source for page in pages]}
+    common: dict[str, Any] = {"files": [page.source for page in pages]}
     common |= {"timestamps": stamps, "frame_rate": rate, "notes": tuple(note for _, note in stacks if note)}
     beyond = 2**62  # the end of any file: offsets in a damaged directory may exceed 64 bits
     offsets = np.array([min(page.plain_offset, beyond) for page in pages], np.int64)
