@@ -106,8 +106,7 @@ class StereoCalibration(Brief):
         for camera, views in enumerate(self.corner_views):
             for v, view in enumerate(views):
                 if isinstance(view, CornerView):
-                    found = np.flatnonzero(~view.accepted & [reason != "" for reason in view.reasons])
-                    rejected += [(v, camera, int(i), view.reasons[i]) for i in found]  # no reason: not in view
+                    rejected += [(v, camera, i, reason) for i, reason in enumerate(view.reasons) if reason]
         r, o = self.refinement, self.refinement.observations
         for i in np.flatnonzero(~r.kept):
             distance = float(np.linalg.norm(r.residuals[i]))
@@ -254,12 +253,9 @@ def calibrate_from_points(
             f"the board's squares are {board.square:g} m: lengths are in metres, {board.square:g} mm is "
             f"{board.square * 1e-3:g}"
         )
-    sizes = np.broadcast_to(np.asarray(image_size), (2, 2))
+    sizes = np.broadcast_to(image_size, (2, 2)).tolist()
     views = [
-        [
-            _view(points, board, (int(size[0]), int(size[1])), sigma_px, f"{name} view {v}")
-            for v, points in enumerate(side)
-        ]
+        [_view(points, board, tuple(size), sigma_px, f"{name} view {v}") for v, points in enumerate(side)]
         for side, size, name in zip((left, right), sizes, CAMERA_NAMES, strict=True)
     ]
     found = calibrate_from_corners(views[0], views[1], board, tolerances, table_view, board_thickness)

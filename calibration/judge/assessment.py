@@ -76,9 +76,8 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
     beyond = root @ directions * np.sqrt(np.maximum(np.maximum(factor, least) - 1.0, 0.0))
     by_common = 0.0 if common is None else inverse.T @ (common.sum(0) * scale[:, None] * scale) @ inverse
     at_minimum = inverse[:s1] + by_common
-    share = s1 / max(
-        float(np.trace(np.linalg.solve(at_minimum, expected))), 1e-12
-    )  # noise moves fewer than s1 directions
+    # noise moves fewer than s1 directions
+    share = s1 / max(float(np.trace(np.linalg.solve(at_minimum, expected))), 1e-12)
     # its weight was multiplied by the disagreement of the views
     extra = max(problem.prior.weight - 1.0, 0.0) * refinement.normal.prior[:-1, :-1] * scale[:, None] * scale
     by_prior = inverse.T @ extra @ inverse
@@ -222,9 +221,8 @@ def _judgement(found: Assessment, refinement: Refinement, wide: TooWide) -> tupl
         )
     if not refinement.converged:
         warnings.append("the refinement did not converge: the result is not the least-squares minimum")
-    worst, why = max(
-        reasons, key=lambda item: item[0], default=(3, "nothing shows how good it is")
-    )  # the first if several are equal
+    # the first if several are equal
+    worst, why = max(reasons, key=lambda item: item[0], default=(3, "nothing shows how good it is"))
     grade = [*GRADES][worst]
     return grade, f"{grade.capitalize()}: {why}", tuple(warnings)
 

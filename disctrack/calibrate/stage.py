@@ -65,14 +65,8 @@ def source_of(recording: Recording) -> CalibrationSource:
             f"{recording.file}: [calibration] names a rig file, so there are no views to calibrate from. "
             "Use that rig as it is, or give left, right, inner_corners and square_mm instead."
         )
-    return CalibrationSource(
-        recording.name,
-        declared_views(recording, views),
-        views.target,
-        table.view,
-        table.board_thickness,
-        recording.board_tolerances,
-    )
+    images, tolerances = declared_views(recording, views), recording.board_tolerances
+    return CalibrationSource(recording.name, images, views.target, table.view, table.board_thickness, tolerances)
 
 
 @checked
