@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.target import described, target_of
+from calibration.board.target import described
 from calibration.cameras.camera import (
     CAMERA_NAMES,
     INTRINSIC_PARAMETERS,
@@ -280,9 +280,14 @@ def read_rig_file(path: str | os.PathLike[str]) -> tuple[StereoRig, Record | Non
 
     Raises RigFileError if the file is missing, damaged or something else.
     """
-    with complete_file(Path(path), "rig", SCHEMA, SCHEMA_VERSION, "calibrate", RigFileError) as file:
+    with complete_rig(Path(path)) as file:
         record = _read_record(file["calibration"]) if "calibration" in file else None
         return read_rig_group(file["rig"]), record
+
+
+def complete_rig(path: Path, command: str = "calibrate") -> contextlib.AbstractContextManager[h5py.File]:
+    """A complete rig file, open for reading. Raises RigFileError, which advises the command."""
+    return complete_file(path, "rig", SCHEMA, SCHEMA_VERSION, command, RigFileError)
 
 
 @contextlib.contextmanager
@@ -362,14 +367,10 @@ def read_beside_cameras(group: h5py.Group, of_cameras: Iterable[Sequence[NDArray
         raise RigFileError(f"{group.name}/covariance is not a covariance")
     if "lens_field" in values:
         values["lens_field"] = LensField(values["lens_field"], float(values.pop("lens_field_spacing")))
-        if min(values["lens_field"].coefficients.shape[2:]) < 4 or not values["lens_field"].spacing > 0:
-            raise RigFileError(f"{group.name}/lens_field is not a field of splines")
     if "allowances" in values:
         shifts, marks = values["allowances"], group["allowances"].attrs
-        causes, assumed = json.loads(marks["causes"]), json.loads(marks["assumed"])
-        if not len(causes) == len(assumed) == len(shifts):
-            raise RigFileError(f"{group.name}/allowances: rows and causes do not match")
-        values["allowances"] = tuple(map(Allowance, causes, shifts, assumed))
+        rows = zip(json.loads(marks["causes"]), shifts, json.loads(marks["assumed"]), strict=True)
+        values["allowances"] = tuple(Allowance(*row) for row in rows)
     is_table = bool(group.attrs.get("world_is_table", 0))
     return StereoRig(cameras[0], cameras[1], world_is_table=is_table, **values)
 
@@ -381,10 +382,6 @@ def _read_record(group: h5py.Group) -> Record:
         return json.loads(group[name].asstr()[()] if name in _LONG else group.attrs[name])
 
     record, table_view = {name: text(name) for name in _IN_JSON}, int(group.attrs["table_view"])
-    points, places = len(target_of(record["board"]).points), len(record["view_names"]) + len(record["apart"])
-    sizes = {"points": points, "places": places, "seen": len(group["pixels"])}
+    sizes = {"places": len(record["view_names"]) + len(record["apart"]), "seen": len(group["pixels"])}
     record |= {name: _get(group, name, row, sizes) for name, row in _OF_RECORD.items()}
-    for name, limit in (("view", places), ("camera", 2), ("point", points)):
-        if len(record[name]) and not (record[name].min() >= 0 and record[name].max() < limit):
-            raise RigFileError(f"{group.name}/{name} points beyond the {limit} there are")
     return record | {"table_view": None if table_view < 0 else table_view}

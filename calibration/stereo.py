@@ -1,8 +1,8 @@
 """From synchronised views of a chessboard, or its corners, to a calibrated stereo rig with its uncertainty."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,25 +15,20 @@ from calibration.fit.board_motion import BoardMotion
 from calibration.fit.lens_field import fit_lens_field
 from calibration.fit.pairing import FLOOR, MIN_VIEWS, Names, Pairs, Views, count_once
 from calibration.fit.refinement import Refinement, refine_stereo
-from calibration.fit.start import start_stereo, too_wide
+from calibration.fit.start import TooWide, start_stereo, too_wide
 from calibration.fit.stereo_model import Observations
 from calibration.judge.assessment import Assessment, assess, stereo_covariance
 from calibration.judge.pairs import PairMotion, camera_moved, compared, judge_pairs, motion_between_exposures, zoomed
-from calibration.judge.tolerances import (
-    BoardTolerances,
-    board_shape,
-    on_the_table,
-    rig_with_covariance,
-    with_tolerances,
-)
+from calibration.judge.tolerances import BoardTolerances, board_shape, rig_with_covariance, with_tolerances
 from calibration.kit.arguments import Thickness, checked
 from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
-from calibration.kit.errors import CalibrationError
+from calibration.kit.errors import CalibrationError, told_as
 from calibration.kit.stuck_pixels import repaired_views
 from calibration.kit.threads import one_blas_thread
 
 LARGEST_SQUARE = 0.5  # m: above, the value was given in millimetres
+UNDETERMINED = "the views do not determine all parameters: add views with the board tilted in several directions"
 OVERSTATED = 0.7  # scatter of corners over the declared sigma, below which the sigma is too large
 
 Image = tuple[str, str]  # name of an unused image, and the reason
@@ -74,8 +69,7 @@ class StereoCalibration(Brief):
     @property
     def reasons(self) -> dict[str, list[str]]:
         """Why views are not used -> names of their images."""
-        not_used = _not_used(self.corner_views, self.view_names)
-        return _by_reason(image for images in not_used.values() for image in images)
+        return _by_reason(chain(*_not_used(self.corner_views, self.view_names).values()))
 
     @property
     def board_points(self) -> Array:
@@ -112,8 +106,7 @@ class StereoCalibration(Brief):
         for camera, views in enumerate(self.corner_views):
             for v, view in enumerate(views):
                 if isinstance(view, CornerView):
-                    found = np.flatnonzero(~view.accepted & [reason != "" for reason in view.reasons])
-                    rejected += [(v, camera, int(i), view.reasons[i]) for i in found]  # no reason: not in view
+                    rejected += [(v, camera, i, reason) for i, reason in enumerate(view.reasons) if reason]
         r, o = self.refinement, self.refinement.observations
         for i in np.flatnonzero(~r.kept):
             distance = float(np.linalg.norm(r.residuals[i]))
@@ -175,18 +168,7 @@ def check_sizes(left: Sequence[NDArray], right: Sequence[NDArray], names: Sequen
                 )
 
 
-@contextmanager
-def _determined() -> Iterator[None]:
-    """Turn the error of a singular problem into a CalibrationError that says what to do."""
-    try:
-        yield
-    except np.linalg.LinAlgError as error:
-        raise CalibrationError(
-            "the views do not determine all parameters: add views with the board tilted in several directions"
-        ) from error
-
-
-@_determined()
+@told_as(CalibrationError, UNDETERMINED, np.linalg.LinAlgError)
 @one_blas_thread
 @checked
 def calibrate_from_corners(
@@ -217,10 +199,17 @@ def calibrate_from_corners(
     for (v, camera), why in pairs.bad_images.items():
         views[camera][v] = BoardNotFound(why)
     apart = _warnings_of_pairs(pairs, names, table_view)
-    _require_fitted(refinement, pairs, _not_used(views, names), apart, wide, table_view)
-    rig, assessment = _judged(refinement, motion, board, tolerances, table_view, board_thickness, wide)
+    not_used = {v: _listed(images) for v, images in _not_used(views, names).items()}
+    _require_table(table_view, dict.fromkeys(pairs.apart, "".join(apart[:1])) | not_used)
+    _require_fitted(refinement, chain(*_not_used(views, names).values()), wide)
+    shape = board_shape(refinement, board.points, refinement.inflation)
+    common = None if refinement.problem.motion else motion_between_exposures(refinement)[1]
+    covariance = stereo_covariance(refinement, common)
+    rig = rig_with_covariance(refinement, table_view, board_thickness, refinement.inflation, covariance, shape.origin)
+    with_board = with_tolerances(rig, board.points, board_thickness, tolerances, shape)
+    assessment = assess(refinement, rig, with_board, motion, wide)
     return StereoCalibration(
-        rig=rig,
+        rig=with_board,
         refinement=refinement,
         board=board,
         tolerances=tolerances,
@@ -264,12 +253,9 @@ def calibrate_from_points(
             f"the board's squares are {board.square:g} m: lengths are in metres, {board.square:g} mm is "
             f"{board.square * 1e-3:g}"
         )
-    sizes = np.broadcast_to(np.asarray(image_size), (2, 2))
+    sizes = np.broadcast_to(image_size, (2, 2)).tolist()
     views = [
-        [
-            _view(points, board, (int(size[0]), int(size[1])), sigma_px, f"{name} view {v}")
-            for v, points in enumerate(side)
-        ]
+        [_view(points, board, tuple(size), sigma_px, f"{name} view {v}") for v, points in enumerate(side)]
         for side, size, name in zip((left, right), sizes, CAMERA_NAMES, strict=True)
     ]
     found = calibrate_from_corners(views[0], views[1], board, tolerances, table_view, board_thickness)
@@ -307,8 +293,8 @@ def _begin(views: Views, board: Target, names: Names) -> tuple[Pairs, list[str]]
 
     For a symmetric board, the order of corners in the right views is changed, in place, to that of the left ones.
     """
-    sizes = tuple(next(v.image_size for v in side if isinstance(v, CornerView)) for side in views)
-    start, orders, notes = start_stereo(_observations(views), board.points, (sizes[0], sizes[1]), names, board.orders)
+    sizes = [next(v.image_size for v in side if isinstance(v, CornerView)) for side in views]
+    start, orders, notes = start_stereo(_observations(views), board, sizes, names)
     if len(board.orders) == 1:
         return start, [*notes]
     for v, order in orders.items():
@@ -341,59 +327,33 @@ def _fit_jointly(
             observations = observations[(observations.view != view) | (observations.camera != camera)]
         used = pairs
         refinement = refined(used)
-    found, corrected = motion_between_exposures(refinement), fit_lens_field(refinement)
-    motion = found and found[0]
-    likely = motion is not None and motion.is_likely
-    if found is not None and motion is not None and likely and corrected.lens_field is not None:
+    (motion, _), corrected = motion_between_exposures(refinement), fit_lens_field(refinement)
+    if motion is None or not motion.is_likely:
+        return corrected, pairs, motion
+    if corrected.lens_field is not None:
         # an (incomplete) lens field moves boards differently in each camera, too: use the scatter before it
-        left, _ = motion_between_exposures(corrected) or found
+        left = motion_between_exposures(corrected)[0] or motion
         motion = replace(left, scatter=max(motion.scatter, left.scatter))
-        likely = motion.is_seen
-    if motion is not None and likely:
-        corrected = fit_lens_field(refined(used, motion.as_random(nominal)))
-    return corrected, pairs, motion
+        if not motion.is_seen:
+            return corrected, pairs, motion
+    return fit_lens_field(refined(used, motion.as_random(nominal))), pairs, motion
 
 
-def _judged(
-    refinement: Refinement,
-    motion: PairMotion | None,
-    board: Target,
-    tolerances: BoardTolerances,
-    table_view: int | None,
-    board_thickness: float,
-    wide: Sequence[tuple[str, str]],
-) -> tuple[StereoRig, Assessment]:
-    """The rig with its covariance, and its assessment."""
-    inflation = max(refinement.disagreement, 1.0)
-    shape = board_shape(refinement, board.points, inflation)
-    moved = None if refinement.problem.motion else motion_between_exposures(refinement)
-    covariance = stereo_covariance(refinement, moved and moved[1])
-    origin = on_the_table(board.points, shape)
-    rig = rig_with_covariance(refinement, table_view, board_thickness, inflation, covariance, origin)
-    rig = replace(rig, lens_field=refinement.lens_field)
-    with_board = with_tolerances(rig, board.points, table_view, board_thickness, tolerances, shape)
-    return with_board, assess(refinement, rig, with_board, table_view, inflation, motion, wide)
-
-
-def _require_fitted(
-    refinement: Refinement,
-    pairs: Pairs,
-    not_used: dict[int, list[Image]],
-    apart: Sequence[str],
-    wide: Sequence[tuple[str, str]],
-    table_view: int | None,
-) -> None:
-    """Raises CalibrationError if the table view cannot be used, or too few views can."""
-    if table_view is not None and (table_view in not_used or table_view in pairs.apart):
-        reason = _listed(not_used[table_view]) if table_view in not_used else apart[0]
+def _require_table(table_view: int | None, unusable: Mapping[int, str]) -> None:
+    """Raises CalibrationError if the table view is one of the `unusable`, for the reason given there."""
+    if table_view is not None and table_view in unusable:
         raise CalibrationError(
-            f"the table view {table_view} cannot be used ({reason}): without it there is no lab frame. Name another "
-            "view whose board lies flat on the table, or take it again."
+            f"the table view {table_view} cannot be used ({unusable[table_view]}): without it there is no lab frame. "
+            "Name another view whose board lies flat on the table, or take it again."
         )
+
+
+def _require_fitted(refinement: Refinement, not_used: Iterable[Image], wide: TooWide) -> None:
+    """Raises CalibrationError if too few views can be used, or if they contradict each other."""
     n_used = len(np.unique(refinement.observations.view[refinement.kept]))
     if n_used < MIN_VIEWS:
         also = "".join(f"{what}: {by_what}. " for what, by_what in wide)
-        listed = _listed(image for images in not_used.values() for image in images)
+        listed = _listed(not_used)
         raise CalibrationError(f"{also}Only {n_used} views can be used, at least {MIN_VIEWS} are needed: {listed}")
     for name, camera in zip(CAMERA_NAMES, refinement.model.rig.cameras, strict=True):
         if not min(camera.fx, camera.fy) > 0.0:
@@ -427,8 +387,6 @@ def _used_alone(views: Views, names: Names) -> list[str]:
 def _require_views(views: Views, names: Names, table_view: int | None) -> None:
     if table_view is not None and not 0 <= table_view < len(names):
         raise CalibrationError(f"table view {table_view} does not exist: there are views 0 to {len(names) - 1}")
-    if not views[0]:
-        raise CalibrationError("no calibration views were given")
     for camera, side in enumerate(views):
         found = sum(isinstance(view, CornerView) for view in side)
         if found < MIN_VIEWS:

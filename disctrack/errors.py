@@ -1,13 +1,12 @@
 """The errors that disctrack raises; only `cli` turns them into a line and an exit code."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 from calibration.kit.errors import ArgumentError as ArgumentError
 from calibration.kit.errors import CalibrationError as CalibrationError
 from calibration.kit.errors import DiscTrackError
 from calibration.kit.errors import RigFileError as RigFileError
+from calibration.kit.errors import told_as as told_as
 
 
 class AnalysisError(DiscTrackError):
@@ -51,18 +50,6 @@ class TrajectoryFileError(DiscTrackError):
 
 class ModelError(DiscTrackError):
     """A model of the motion cannot be built: unknown effect or parameter, a value out of bounds, no such motion."""
-
-
-@contextmanager
-def told_as(error: type[DiscTrackError], said: str, *kinds: type[Exception], then: str = "") -> Iterator[None]:
-    """Convert exceptions of these kinds, mostly of libraries, into an error of ours: `said`, reason, `then`."""
-    try:
-        yield
-    except DiscTrackError:
-        raise
-    except kinds as reason:
-        why = getattr(reason, "strerror", "") or " ".join(str(reason).split()) or type(reason).__name__
-        raise error(f"{said}: {why.removesuffix('.')}.{f' {then}' if then else ''}") from reason
 
 
 def reason_of(error: BaseException) -> str:

@@ -24,9 +24,8 @@ import numpy as np
 from calibration.kit._cholesky import solve_in_place
 from calibration.kit.compiled import njit, part
 
-N_CORNER = (
-    9  # x, y [px], two edge angles [rad], blur sigma [px], mean grey, half contrast, relative light gradient [1/px]
-)
+# x, y [px], two edge angles [rad], blur sigma [px], mean grey, half contrast, relative light gradient [1/px]
+N_CORNER = 9
 FLAT = 0.995  # |S| above which a pixel lies inside a square, where the residual is the image noise
 MIN_BLUR = 0.3  # px, just above that of the square pixel: sharpened edges may be sharper than any lens makes them
 _FAR = 5.0  # sigmas from an edge, beyond which S is constant to 6e-7

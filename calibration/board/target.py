@@ -116,11 +116,5 @@ _KINDS: dict[str, type[Target]] = {"chessboard": Board, "charuco": CharucoBoard}
 
 
 def described(target: Target) -> dict[str, Any]:
-    """Kind and fields, the argument of `target_of`."""
+    """Kind and fields."""
     return {"target": next(name for name, kind in _KINDS.items() if isinstance(target, kind)), **asdict(target)}
-
-
-def target_of(description: dict[str, Any]) -> Target:
-    """Inverse of `described`."""
-    fields = dict(description)
-    return _KINDS[fields.pop("target")](**fields)

@@ -43,18 +43,23 @@ Views = tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]
 class BoardPoses:
     """Poses of the board in n images of one camera, from that camera alone."""
 
+    views: NDArray[np.intp]  # (n,) ascending numbers of the images
     R: Array  # (n, 3, 3) board to camera
     middle: Array  # (n, 3) [m] of the board
     covariance: Array  # (n, 6, 6) of rotation and shift of the middle, for 1 px of noise, times the number of points
 
     def __getitem__(self, index: NDArray) -> BoardPoses:
-        return BoardPoses(self.R[index], self.middle[index], self.covariance[index])
+        return BoardPoses(self.views[index], self.R[index], self.middle[index], self.covariance[index])
+
+    def of(self, views: NDArray) -> BoardPoses:
+        """Those of images with these numbers."""
+        return self[np.searchsorted(self.views, views)]
 
     def turned(self, turn: Array, mirror: bool = False) -> BoardPoses:
         """With the board rotated (3, 3) about its middle, and, if `mirror`, the camera's x reversed."""
         F = np.diag([-1.0 if mirror else 1.0, 1.0, 1.0])
         B = _both(-F if mirror else F, F)  # a rotation is an axial vector
-        return BoardPoses(F @ self.R @ turn, self.middle @ F, B @ self.covariance @ B.T)
+        return BoardPoses(self.views, F @ self.R @ turn, self.middle @ F, B @ self.covariance @ B.T)
 
 
 def count_once(views: Views, names: Names, table_view: int | None) -> None:
@@ -108,7 +113,7 @@ def poses_of(poses: Mapping[int, Pose], seen_by: Observations, points: Array, ca
         information = J.T @ J / len(seen)
         information += 1e-9 * np.diag(np.diag(information))  # points on a line leave one rotation undetermined
         found.append((R, at, np.linalg.inv(information)))
-    return BoardPoses(*(np.stack(part) for part in zip(*found, strict=True)))
+    return BoardPoses(np.array(list(poses)), *(np.stack(part) for part in zip(*found, strict=True)))
 
 
 def apart(left: BoardPoses, right: BoardPoses, R_pair: Array, t_pair: Array) -> Array:
@@ -128,7 +133,7 @@ def relative_poses(left: BoardPoses, right: BoardPoses) -> tuple[Array, Array]:
     return R, right.middle - np.einsum("nij,nj->ni", R, left.middle)
 
 
-Paired = tuple[list[int], BoardPoses, list[BoardPoses]]  # left views; poses of the board in both cameras
+Paired = tuple[BoardPoses, list[BoardPoses]]  # of pairs: in the left images, and in the right ones for each symmetry
 
 
 @dataclass(frozen=True)
@@ -218,31 +223,24 @@ def board_turns(n: int) -> list[Array]:
 
 
 def paired(
-    sides: tuple[BoardPoses, BoardPoses],
-    views: tuple[Sequence[int], Sequence[int]],
-    nominal: Array,
-    n_orders: int,
-    floor: float,
-    names: Names,
+    sides: tuple[BoardPoses, BoardPoses], nominal: Array, n_orders: int, floor: float, names: Names
 ) -> tuple[Pairing, tuple[str, ...]]:
     """The pairs as stored, and warnings about them. Raises CalibrationError if they are no pairs.
 
-    sides : poses of the board in the images of each camera; views : ascending numbers of these images
+    sides : poses of the board in the images of each camera
     names : (left, right) of all views; n_orders : number of symmetries of the target
     """
     (left, right), is_square = sides, np.allclose(*np.ptp(nominal, axis=0)[:2])
     as_seen = [right.turned(turn) for turn in board_turns(n_orders)]
     mirrored = [right.turned(turn @ np.diag([-1.0, 1.0, 1.0]), True) for turn in board_turns(4 if is_square else 2)]
-    place = [{view: i for i, view in enumerate(side)} for side in views]
 
-    def pairs_of(right_of: NDArray, among: Sequence[int] = views[0], turns: Sequence[BoardPoses] = as_seen) -> Paired:
-        both = [v for v in among if right_of[v] in place[1]]
-        b = np.array([place[1][right_of[v]] for v in both], int)
-        return both, left[np.array([place[0][v] for v in both], int)], [one[b] for one in turns]
+    def pairs_of(right_of: NDArray, among: NDArray = left.views, turns: Sequence[BoardPoses] = as_seen) -> Paired:
+        both = among[np.isin(right_of[among], right.views)]
+        return left.of(both), [one.of(right_of[both]) for one in turns]
 
     number = np.arange(len(names))
-    both, of_left, of_right = pairs_of(number)
-    n = len(both)
+    of_left, of_right = pairs_of(number)
+    n = len(of_left.views)
     if not n:
         raise CalibrationError("no view shows the target to both cameras: the pair cannot be calibrated")
     stored = most_likely(of_left, of_right, floor)
@@ -252,13 +250,13 @@ def paired(
     orders = [(f"{abs(k)} {'late' if k > 0 else 'early'}", number + k) for k in shifts if k]
     orders += [("in reversed order", number[::-1] + k) for k in shifts]
     tried = [("", number, pairs_of(number, turns=mirrored)), *((how, by, pairs_of(by)) for how, by in orders)]
-    others = [(how, by, which, most_likely(a, b, floor)) for how, by, (which, a, b) in tried if len(which) > MIN_VIEWS]
+    others = [(how, by, a.views, most_likely(a, b, floor)) for how, by, (a, b) in tried if len(a.views) > MIN_VIEWS]
     if others:
         how, by, which, found = max(others, key=lambda one: one[-1].evidence)
         if found.is_likelier(stored):
             raise CalibrationError(_reason(how, found, stored, [(names[v][0], names[by[v]][1]) for v in which]))
     _require_agreement(stored, [found.evidence for how, _, _, found in others if how])
-    notes = _late(pairs_of, [v for v, fits in zip(both, stored.agrees, strict=True) if not fits], stored, names)
+    notes = _late(pairs_of, of_left.views[~stored.agrees], stored, names)
     if notes and 2 * stored.agrees.sum() <= n:
         raise CalibrationError(f"{'; '.join(notes)}. As stored {stored.agrees.sum()} of {n} pairs are right")
     return stored, notes
@@ -299,15 +297,15 @@ def _require_agreement(stored: Pairing, others: Sequence[float]) -> None:
 
 
 def _late(
-    pairs_of: Callable[[NDArray, Sequence[int]], Paired], odd: Sequence[int], found: Pairing, names: Names
+    pairs_of: Callable[[NDArray, NDArray], Paired], odd: NDArray[np.intp], found: Pairing, names: Names
 ) -> tuple[str, ...]:
     """Warnings about pairs among the `odd` that would agree with a later or an earlier right view."""
-    rest, notes = list(odd), []
+    rest, notes = odd, []
     for k in sorted(range(-MOST_LATE, MOST_LATE + 1), key=abs)[1:]:
-        both, left, turns = pairs_of(np.arange(len(names)) + k, rest)
+        left, turns = pairs_of(np.arange(len(names)) + k, rest)
         off = np.min([apart(left, right, found.R_right_left[None], found.t_right_left[None])[0] for right in turns], 0)
-        which = [v for v, distance in zip(both, off, strict=True) if distance < TOO_FAR * found.usual]
-        rest = [v for v in rest if v not in which]
+        which = left.views[off < TOO_FAR * found.usual]
+        rest = np.setdiff1d(rest, which)
         if len(which) >= MIN_VIEWS:
             notes.append(
                 f"{names[which[0]][0]} to {names[which[-1]][0]}: {len(which)} pairs agree with the others if the right "

@@ -6,6 +6,7 @@ that is not significant need not be zero, and without it, its error would bias a
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -44,13 +45,13 @@ class Refinement:
     converged: bool
     lens_field: LensField | None = None  # by which the observations were corrected
 
-    @property
-    def disagreement(self) -> float:
+    @cached_property
+    def inflation(self) -> float:
         """Variance of the parameters from the scatter of views, over that predicted by the corners' noise.
 
-        1 for a correct model, larger if errors are common to the corners of a view.
+        At least 1, as for a correct model; larger if errors are common to the corners of a view.
         """
-        return self.normal.disagreement(N_STEREO)
+        return max(self.normal.disagreement(N_STEREO), 1.0)
 
     def rms(self, select: Mask | None = None) -> float:
         """Root mean square distance [px] of observed from predicted points, of those kept or also selected."""

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.board.target import LEAST_POINTS
+from calibration.board.target import LEAST_POINTS, Target
 from calibration.cameras.camera import CAMERA_NAMES, Camera, StereoRig, rotation_from_vector
 from calibration.fit.pairing import FLOOR, GOOD_VIEWS, MOST_TRIED, Names, Pairs, board_turns, paired, poses_of
 from calibration.fit.stereo_model import Observations, StereoModel
@@ -22,6 +22,7 @@ WIDE = 0.8  # half the image diagonal in focal lengths, 77 deg: the polynomial d
 # for a 150 deg lens, 0.98 to 1.00 for eight ordinary cameras with 8 to 20 views. Two focal lengths over one: 0.98 for
 # an unchanged lens.
 CLEARLY = 0.85
+TooWide = tuple[tuple[str, str], ...]  # warnings about lenses, each with its evidence
 
 
 def for_opencv(
@@ -60,9 +61,7 @@ def start_camera(
         raise CalibrationError(f"{name} camera: no start for the calibration, OpenCV says: {error.err}") from error
     finally:
         cv2.setNumThreads(threads)
-    camera = Camera(
-        float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), (k1, 0.0, 0.0, 0.0, 0.0), image_size
-    )
+    camera = Camera.from_parameters(np.array([*K[[0, 1, 0, 1], [0, 1, 2, 2]], k1, 0, 0, 0, 0]), image_size)
     poses = {
         view: (rotation_from_vector(np.ravel(turn)), np.ravel(shift).astype(float))
         for view, turn, shift in zip(views, turns, shifts, strict=True)
@@ -71,25 +70,21 @@ def start_camera(
 
 
 def start_stereo(
-    observations: Observations,
-    nominal: Array,
-    image_sizes: tuple[tuple[int, int], tuple[int, int]],
-    names: Names,
-    orders: Sequence[NDArray[np.intp]] | None = None,
+    observations: Observations, target: Target, image_sizes: Sequence[tuple[int, int]], names: Names
 ) -> tuple[Pairs, dict[int, NDArray[np.intp]], tuple[str, ...]]:
     """Rough cameras, their relative pose, and which images are pairs.
 
-    names : (left, right) of all views; orders : symmetries of the target; by default the identity
+    image_sizes : of the left and of the right camera; names : (left, right) of all views
     returns also : order of the target's points in the right image of each pair; and notes about the pairs
     Raises CalibrationError if the images do not determine a camera, or are no pairs; see `pairing`.
     """
-    orders, n_views = orders or [np.arange(len(nominal))], len(names)
+    nominal, orders, n_views = target.points, target.orders, len(names)
     begun = [start_camera(observations, index, nominal, size) for index, size in enumerate(image_sizes)]
     cameras, poses, _ = zip(*begun, strict=True)
     sides = [observations[observations.camera == index] for index in (0, 1)]
     places = [poses_of(seen, o, nominal, camera) for o, (camera, seen, _) in zip(sides, begun, strict=True)]
     floor = FLOOR * max(max(size) for size in image_sizes)
-    pairs, notes = paired((places[0], places[1]), (list(poses[0]), list(poses[1])), nominal, len(orders), floor, names)
+    pairs, notes = paired((places[0], places[1]), nominal, len(orders), floor, names)
     both = [v for v in poses[0] if v in poses[1]]
     R_pair, t_pair = pairs.R_right_left, pairs.t_right_left
     between, distance = (float(np.median(np.linalg.norm(t, axis=-1))) for t in (t_pair, [poses[0][v][1] for v in both]))
@@ -112,7 +107,7 @@ def start_stereo(
     return Pairs(model, np.array(both)), orders_seen, notes
 
 
-def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, Camera]) -> tuple[tuple[str, str], ...]:
+def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, Camera]) -> TooWide:
     """Warnings, with their evidence, about lenses that the rational model describes far better than the polynomial.
 
     nominal : (n, 3) [m] the declared points of the target; cameras : initial guess of the refinement

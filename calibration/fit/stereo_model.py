@@ -7,13 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.cameras.camera import (
-    N_RIG,
-    PAIR_SHIFT,
-    StereoRig,
-    by_turning,
-    rotation_from_vector,
-)
+from calibration.cameras.camera import N_RIG, PAIR_SHIFT, StereoRig, by_turning, rotation_from_vector
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Mask
 from calibration.kit.errors import ArgumentError

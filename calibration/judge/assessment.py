@@ -1,6 +1,5 @@
 """Assessment of a calibration: consistency, coverage, uncertainty in px and mm, and a verdict in words."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +7,7 @@ import numpy as np
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig, causes
 from calibration.fit.pairing import GOOD_VIEWS, TWICE
 from calibration.fit.refinement import Refinement, held_out
+from calibration.fit.start import TooWide
 from calibration.fit.stereo_model import N_STEREO
 from calibration.judge.pairs import PairMotion
 from calibration.kit.arrays import Array
@@ -76,9 +76,8 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
     beyond = root @ directions * np.sqrt(np.maximum(np.maximum(factor, least) - 1.0, 0.0))
     by_common = 0.0 if common is None else inverse.T @ (common.sum(0) * scale[:, None] * scale) @ inverse
     at_minimum = inverse[:s1] + by_common
-    share = s1 / max(
-        float(np.trace(np.linalg.solve(at_minimum, expected))), 1e-12
-    )  # noise moves fewer than s1 directions
+    # noise moves fewer than s1 directions
+    share = s1 / max(float(np.trace(np.linalg.solve(at_minimum, expected))), 1e-12)
     # its weight was multiplied by the disagreement of the views
     extra = max(problem.prior.weight - 1.0, 0.0) * refinement.normal.prior[:-1, :-1] * scale[:, None] * scale
     by_prior = inverse.T @ extra @ inverse
@@ -118,10 +117,10 @@ def _shifts_of_points(rig: StereoRig, points_world: Array) -> Array:
     return -solve_each(J, K)
 
 
-def measurement_volume(refinement: Refinement, table_view: int | None) -> Array:
+def measurement_volume(refinement: Refinement, on_table: bool) -> Array:
     """Points (n, 3) [m] in world axes for which uncertainty is stated: the board of the table view and above it."""
     points = refinement.model.points
-    if table_view is not None:
+    if on_table:
         size = np.ptp(points, axis=0)[:2].min()
         return np.concatenate([points + np.array([0, 0, height]) for height in (0.0, 0.5 * size)])
     views = np.unique(refinement.observations.view[refinement.kept])
@@ -144,13 +143,7 @@ def length_uncertainty(rig: StereoRig, points_world: Array) -> tuple[float, floa
 
 
 def assess(
-    refinement: Refinement,
-    rig: StereoRig,
-    rig_with_board: StereoRig,
-    table_view: int | None,
-    inflation: float,
-    motion: PairMotion | None,
-    wide: Sequence[tuple[str, str]],
+    refinement: Refinement, rig: StereoRig, rig_with_board: StereoRig, motion: PairMotion | None, wide: TooWide
 ) -> Assessment:
     """Compute the figures and the verdict.
 
@@ -159,7 +152,7 @@ def assess(
     """
     kept = refinement.observations[refinement.kept]
     both = np.intersect1d(kept.view[kept.camera == 0], kept.view[kept.camera == 1])
-    volume = measurement_volume(refinement, table_view)
+    volume = measurement_volume(refinement, rig.world_is_table)
     sigma = np.linalg.norm(point_uncertainty(rig, volume), axis=-1)
     along, across = length_uncertainty(rig, volume)
     place, most = causes(rig_with_board, _shifts_of_points(rig_with_board, volume))
@@ -174,7 +167,7 @@ def assess(
         distance=float(np.linalg.norm(rig.R_left_world @ volume.mean(0) + rig.t_left_world)),
         pairs=int(np.sum(~refinement.problem.apart[both])),
         motion=motion,
-        inflation=inflation,
+        inflation=refinement.inflation,
         coverage=tuple(float(np.mean(cells_of(refinement, camera) > 0)) for camera in range(len(CAMERA_NAMES))),
         tilt_spread_deg=tilt_spread(refinement),
     )
@@ -182,9 +175,7 @@ def assess(
     return replace(found, grade=grade, verdict=verdict, figures=_figures(found, refinement.rms()), warnings=warnings)
 
 
-def _judgement(
-    found: Assessment, refinement: Refinement, wide: Sequence[tuple[str, str]]
-) -> tuple[str, str, tuple[str, ...]]:
+def _judgement(found: Assessment, refinement: Refinement, wide: TooWide) -> tuple[str, str, tuple[str, ...]]:
     """The worst grade of all figures, its reason, and warnings about figures that need action."""
     warnings, reasons = [": ".join(what) for what in wide], [(3, what) for what, _ in wide]
     errors = found.triangulation_sigma[0], found.held_out_error
@@ -230,9 +221,8 @@ def _judgement(
         )
     if not refinement.converged:
         warnings.append("the refinement did not converge: the result is not the least-squares minimum")
-    worst, why = max(
-        reasons, key=lambda item: item[0], default=(3, "nothing shows how good it is")
-    )  # the first if several are equal
+    # the first if several are equal
+    worst, why = max(reasons, key=lambda item: item[0], default=(3, "nothing shows how good it is"))
     grade = [*GRADES][worst]
     return grade, f"{grade.capitalize()}: {why}", tuple(warnings)
 

@@ -60,8 +60,8 @@ class PairMotion:
         return TWICE * max(self.scatter, self.at_rest)
 
 
-def motion_between_exposures(refinement: Refinement) -> tuple[PairMotion, Array] | None:
-    """Motion of the board between the exposures of the pairs; None with fewer than three pairs.
+def motion_between_exposures(refinement: Refinement) -> tuple[PairMotion | None, Array | None]:
+    """Motion of the board between the exposures of the pairs; (None, None) with fewer than three pairs.
 
     From the pairs with enough points in both images, linearised at the minimum.
     returns also : (n_views, s, s) covariance that motions of the likely size add to each view's gradient with respect
@@ -72,7 +72,7 @@ def motion_between_exposures(refinement: Refinement) -> tuple[PairMotion, Array]
     seen = [np.bincount(o.view[o.camera == c], minlength=n_views) for c in (0, 1)]
     pairs = np.flatnonzero((np.minimum(*seen) >= LEAST_POINTS) & ~problem.apart)
     if len(pairs) < MIN_VIEWS:
-        return None
+        return None, None
     free = replace(problem, motion=None, apart=np.ones_like(problem.apart))
     normal = free.linearise(model)
     carried = normal.carried()

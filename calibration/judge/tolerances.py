@@ -43,6 +43,9 @@ class BoardShape:
     lift: float
     lift_sigma: float
     misprint: float  # [m] rms per coordinate of the corners in their plane, beyond stretch and shear
+    # (3,) [m] point one declared thickness above the world's origin, in the board's axes: below corner 0, which a
+    # stretch moves, at the height of the lowest parts of the printed face
+    origin: Array
 
 
 def board_shape(refinement: Refinement, nominal: Array, inflation: float) -> BoardShape:
@@ -60,14 +63,17 @@ def board_shape(refinement: Refinement, nominal: Array, inflation: float) -> Boa
     found = refined + normal.step()[0][N_STEREO:]
     C = inflation * normal.covariances()[0][N_STEREO:, N_STEREO:]
     heights = _over_the_board(nominal, basis[:, 2, bends])
+    refined_stretch, refined_lift = STRETCH * float(refined[3]), -float((heights @ refined[bends]).min())
+    x, y, _ = 0.5 * refined_stretch * nominal.mean(0)  # of the middle relative to corner 0
     return BoardShape(
-        refined_stretch=STRETCH * float(refined[3]),
+        refined_stretch=refined_stretch,
         stretch=STRETCH * float(found[3]),
         stretch_sigma=STRETCH * float(np.sqrt(C[3, 3])),
-        refined_lift=-float((heights @ refined[bends]).min()),
+        refined_lift=refined_lift,
         lift=-float((heights @ found[bends]).min()),
         lift_sigma=float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", heights, C[bends, bends], heights)))),
         misprint=float(np.sqrt(np.mean((basis[:, :2, others] @ refined[others]) ** 2))),
+        origin=np.array([-x, y, -refined_lift]),
     )
 
 
@@ -85,22 +91,8 @@ def _over_the_board(nominal: Array, heights: Array) -> Array:
     return found
 
 
-def on_the_table(nominal: Array, shape: BoardShape) -> Array:
-    """(3,) [m] point one declared thickness above the world's origin, in the axes of a board of this shape.
-
-    It is below corner 0, which a stretch moves, at the height of the lowest parts of the printed face.
-    """
-    x, y, _ = 0.5 * shape.refined_stretch * nominal.mean(0)  # of the middle relative to corner 0
-    return np.array([-x, y, -shape.refined_lift])
-
-
 def with_tolerances(
-    rig: StereoRig,
-    nominal: Array,
-    table_view: int | None,
-    board_thickness: float,
-    tolerances: BoardTolerances,
-    shape: BoardShape,
+    rig: StereoRig, nominal: Array, board_thickness: float, tolerances: BoardTolerances, shape: BoardShape
 ) -> StereoRig:
     """The rig with the tolerances of the board's sizes added to its covariance, and listed by cause.
 
@@ -131,7 +123,7 @@ def with_tolerances(
             found.append(Allowance(cause, parameters, cause in assumed and assumed[cause] is None))
 
     R, half, middle = rig.R_left_world, np.abs(d).max(0), nominal.mean(0)
-    if table_view is None:
+    if not rig.world_is_table:
         allow(SIZE, np.zeros(3), pair=size * rig.t_right_left)
     else:
         allow(SIZE, size * (rig.t_left_world + board_thickness * R[:, 2]), pair=size * rig.t_right_left)
@@ -168,7 +160,7 @@ def rig_with_covariance(
     origin : (3,) [m] point one thickness above the world's origin, in board axes; by default corner 0
     stereo : better estimate of the covariance of the free stereo parameters, see `assessment.stereo_covariance`
     """
-    model, rig = refinement.model, refinement.model.rig
+    model, rig = refinement.model, replace(refinement.model.rig, lens_field=refinement.lens_field)
     shared, poses, cross = refinement.normal.covariances()
     view, M = table_view or 0, np.zeros((6, 6))  # d world / d pose of the board; zero without a table
     free = shared[:N_STEREO, :N_STEREO]

@@ -71,7 +71,7 @@ def checked(target: T) -> T:
             bound = signature.bind(*given, **named)
         except TypeError as error:
             raise ArgumentError(f"{what}: {error}; it takes {signature}") from error
-        hints = _hints(target)
+        hints = _hints(target, include_extras=True)
         for name, value in bound.arguments.items():
             if name in hints:
                 bound.arguments[name] = _as(value, hints[name], f"{what}: {name}")
@@ -80,13 +80,7 @@ def checked(target: T) -> T:
     return cast("T", with_checked)
 
 
-@functools.cache
-def _hints(function: Callable[..., Any]) -> dict[str, Any]:
-    """Annotations of the parameters that take one value."""
-    hints = get_type_hints(function, include_extras=True)
-    several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-    parameters = inspect.signature(function).parameters.items()
-    return {name: hints[name] for name, p in parameters if name in hints and p.kind not in several}
+_hints = functools.cache(get_type_hints)  # not before a call: annotations may name what is defined later
 
 
 def _as(value: Any, kind: Any, name: str) -> Any:
@@ -158,7 +152,7 @@ def _collection(value: Any, kind: type, parts: tuple[Any, ...]) -> Any:
 
 def _object(value: Any, kind: type) -> Any:
     """An object of a class, also from its file or from a result that contains it."""
-    if getattr(kind, "_is_protocol", False) or isinstance(value, kind):
+    if isinstance(value, kind):
         return value
     if (reader := getattr(kind, "read_by", "")) and isinstance(value, str | os.PathLike):
         return resolve_name(reader)(value)

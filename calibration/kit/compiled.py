@@ -48,10 +48,8 @@ def _folder() -> Path:
     own = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "disctrack"
     user = getattr(os, "getuid", int)()  # Windows states 0 for the owner of a file
     places = Path(__file__).parent / "__pycache__", own, Path(tempfile.gettempdir()) / f"disctrack-{user}"
-    kept = Path(
-        config.CACHE_DIR or next((place for place in places if _is_own(place, user)), None) or tempfile.mkdtemp()
-    )
-    return kept / f"compiled-{sources.hexdigest()[:16]}"
+    kept = config.CACHE_DIR or next((place for place in places if _is_own(place, user)), None) or tempfile.mkdtemp()
+    return Path(kept) / f"compiled-{sources.hexdigest()[:16]}"
 
 
 def _is_own(place: Path, user: int) -> bool:

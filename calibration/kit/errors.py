@@ -3,6 +3,9 @@
 Every message states the file, frame or camera, what was found, what was expected and what to do.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class DiscTrackError(Exception):
     """Base of every error this distribution raises on purpose.
@@ -27,3 +30,15 @@ class CalibrationError(DiscTrackError):
 
 class RigFileError(DiscTrackError):
     """A rig file cannot be read, or does not contain a stereo rig."""
+
+
+@contextmanager
+def told_as(error: type[DiscTrackError], said: str, *kinds: type[Exception], then: str = "") -> Iterator[None]:
+    """Convert exceptions of these kinds, mostly of libraries, into an error of ours: `said`, reason, `then`."""
+    try:
+        yield
+    except DiscTrackError:
+        raise
+    except kinds as reason:
+        why = getattr(reason, "strerror", "") or " ".join(str(reason).split()) or type(reason).__name__
+        raise error(f"{said}: {why.removesuffix('.')}.{f' {then}' if then else ''}") from reason

@@ -46,11 +46,7 @@ def _image_frame(axes: Axes, found: StereoCalibration, camera: int) -> None:
     counts = cells_of(found.refinement, camera)
     edges = [np.linspace(-0.5, size - 0.5, n + 1) for size, n in zip((width, height), counts.shape, strict=True)]
     axes.pcolormesh(*edges, np.where(counts > 0, counts, np.nan).T, cmap=_SHADES, vmin=0)
-    axes.set_xlim(-0.5, width - 0.5)
-    axes.set_ylim(height - 0.5, -0.5)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x (px)")
-    axes.set_ylabel("y (px)")
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="x (px)", ylabel="y (px)")
 
 
 def _arrows(axes: Axes, found: StereoCalibration, camera: int, scale: float, most: float) -> None:

@@ -7,18 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import h5py
-
 from calibration import BoardTolerances, StereoCalibration, StereoRig
 from calibration.board import corner_fit
 from calibration.board.search import Progress
 from calibration.board.target import Target, described
 from calibration.kit.arguments import checked
-from calibration.kit.seal import check_seal
-from calibration.rig_file import Record, read_rig, read_rig_file, rig_bytes
+from calibration.rig_file import Record, complete_rig, read_rig, read_rig_file, rig_bytes
 from disctrack.analyse.declaration import Boards
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views
-from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError, told_as
+from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import write_whole
 from disctrack.findings import Finding, Kind, Severity, of_kind
@@ -68,14 +65,8 @@ def source_of(recording: Recording) -> CalibrationSource:
             f"{recording.file}: [calibration] names a rig file, so there are no views to calibrate from. "
             "Use that rig as it is, or give left, right, inner_corners and square_mm instead."
         )
-    return CalibrationSource(
-        recording.name,
-        declared_views(recording, views),
-        views.target,
-        table.view,
-        table.board_thickness,
-        recording.board_tolerances,
-    )
+    images, tolerances = declared_views(recording, views), recording.board_tolerances
+    return CalibrationSource(recording.name, images, views.target, table.view, table.board_thickness, tolerances)
 
 
 @checked
@@ -190,14 +181,10 @@ def is_rig_of(path: Path, source: CalibrationSource) -> bool:
 
 
 def _reusable(path: Path, provenance: Provenance) -> dict[str, Any] | None:
-    """Summary of the rig in `path` if it is complete and from the same inputs; None otherwise."""
-    said = f"{path}: exists and is not a readable rig file"
-    remedy = "Move it away, or replace it with --overwrite."
-    with told_as(RigFileError, said, Exception, then=remedy):  # on damaged files, the HDF5 library raises many kinds
-        check_seal(path)
-        with h5py.File(path, "r") as file:
-            same = file.attrs.get("fingerprint") == provenance.fingerprint and int(file.attrs.get("complete", 0)) == 1
-            return dict(json.loads(file.attrs["summary"])) if same else None
+    """Summary of the rig in `path` if it is from the same inputs; None otherwise. Raises RigFileError."""
+    with complete_rig(path, "calibrate --overwrite") as file:
+        same = file.attrs.get("fingerprint") == provenance.fingerprint
+        return dict(json.loads(file.attrs["summary"])) if same else None
 
 
 def _calibrate(source: CalibrationSource) -> tuple[StereoCalibration, tuple[str, ...]]:

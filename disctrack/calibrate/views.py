@@ -156,22 +156,19 @@ def calibrate_views(
             f"{views.place}: [table] view = {table_view}, but there are {len(views)} calibration views, "
             "counted from 0. Name the view whose board lies flat on the table."
         )
-    images: tuple[list[NDArray], list[NDArray]] = ([], [])
-    used, problems = [], []
+    read: dict[int, tuple[NDArray, ...]] = {}
+    problems = []
     for i, pair in enumerate(zip(views.left, views.right, strict=True)):
         try:
-            left, right = map(_pixels, pair, views.fields, views.parts)
+            read[i] = tuple(map(_pixels, pair, views.fields, views.parts))
         except RecordingError as error:
             if i == table_view:
                 raise RecordingError(f"{error} It is the table view: without it there is no lab frame.") from error
             problems.append(f"left out: {error}")
-            continue
-        used.append(i)
-        images[0].append(left)
-        images[1].append(right)
-    names = [(str(views.left[i]), str(views.right[i])) for i in used]
-    position = None if table_view is None else used.index(table_view)
-    found = calibrate_stereo(*images, target, tolerances, position, board_thickness, names, progress)
+    names = [(str(views.left[i]), str(views.right[i])) for i in read]
+    position = None if table_view is None else list(read).index(table_view)
+    left, right = ([pair[side] for pair in read.values()] for side in (0, 1))
+    found = calibrate_stereo(left, right, target, tolerances, position, board_thickness, names, progress)
     return found, tuple(problems)
 
 

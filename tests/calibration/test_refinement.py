@@ -13,7 +13,7 @@ from calibration.fit.normal_equations import minimise
 from calibration.fit.pairing import FLOOR
 from calibration.fit.priors import BEND, PARTS, VARIANCES, board_basis
 from calibration.fit.start import start_stereo
-from calibration.fit.stereo_model import moved
+from calibration.fit.stereo_model import N_STEREO, moved
 from calibration.judge.pairs import compared
 from calibration.judge.tolerances import rig_with_covariance, table_pose
 from tests.oracles.drawn_boards import make_scene, squared
@@ -157,7 +157,7 @@ def test_pixels_that_are_not_square_are_no_hindrance_to_the_start(rng, aspect):
     scene = scene.with_rig(left=cameras[0], right=cameras[1])
     o = scene.observations(0.02, rng)
     sizes = cameras[0].image_size, cameras[1].image_size
-    begun, _, _ = start_stereo(o, scene.board.points, sizes, [("left", "right")] * 10)
+    begun, _, _ = start_stereo(o, scene.board, sizes, [("left", "right")] * 10)
     assert not compared(o, begun, None, FLOOR).apart
     found = refine_stereo(o, begun.joined(o), scene.board.points)
     left = found.model.rig.left
@@ -169,7 +169,7 @@ def test_a_bent_board_is_recovered(rng):
     bends = board_basis(flat.board.points)[..., :3] / BEND / 0.032  # half of eight squares of 8 mm
     scene = make_scene(n_views=12, deviation=bends @ np.array([0.15e-3, 0.05e-3, -0.1e-3]))
     o = scene.observations(0.02, rng)
-    begun, _, _ = start_stereo(o, scene.board.points, ((512, 512), (512, 512)), [("left", "right")] * 12)
+    begun, _, _ = start_stereo(o, scene.board, ((512, 512), (512, 512)), [("left", "right")] * 12)
     assert not compared(o, begun, None, FLOOR).apart
     found = refine_stereo(o, begun.joined(o), scene.board.points)
     assert_allclose(found.model.points[:, 2], scene.model.points[:, 2], atol=5e-6)  # 0.02 px of 0.25 mm, 24 images each
@@ -214,10 +214,10 @@ def test_the_shape_of_a_board_is_the_mean_over_all_variances_by_their_likelihood
 def test_errors_common_to_a_view_inflate_the_covariance(rng):
     scene = make_scene(n_views=16)
     o = scene.observations(0.02, rng)
-    quiet = refine_stereo(o, scene.model, scene.board.points).disagreement
+    quiet = refine_stereo(o, scene.model, scene.board.points).normal.disagreement(N_STEREO)
     shear = rng.normal(size=(16, 2, 2)) * 3e-4  # a bend of the images that changes from view to view
     centred = o.pixels - 256.0
     pixels = o.pixels + shear[o.view, o.camera] * centred[:, :1] * centred[:, 1:] / 256
-    noisy = refine_stereo(replace(o, pixels=pixels), scene.model, scene.board.points).disagreement
+    noisy = refine_stereo(replace(o, pixels=pixels), scene.model, scene.board.points).normal.disagreement(N_STEREO)
     assert 0.4 < quiet < 1.8  # 16 views: scatter of about 0.25
     assert noisy > 1.5 * quiet

@@ -8,14 +8,14 @@ from numpy.testing import assert_allclose
 
 from calibration import Board, BoardTolerances, refine_stereo
 from calibration.cameras.camera import N_RIG
-from calibration.judge.tolerances import BoardShape, board_shape, on_the_table, rig_with_covariance, with_tolerances
+from calibration.judge.tolerances import BoardShape, board_shape, rig_with_covariance, with_tolerances
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from tests.oracles.drawn_boards import make_scene
 
 BOARD = Board((9, 6), 8e-3)
 THICK = 3e-3
-AS_DRAWN = BoardShape(*np.zeros(7))
+AS_DRAWN = BoardShape(*np.zeros(7), origin=np.zeros(3))
 POINTS = np.random.default_rng(5).uniform([0, 0, 0], [0.06, 0.04, 0.02], (20, 3))
 
 
@@ -24,7 +24,7 @@ def covariance_of(**only):
     rig = rig_of(Scene())
     none = {"square": 0.0, "flatness": 0.0, "thickness": 0.0}
     board = BoardTolerances(**(none | only))
-    return rig, with_tolerances(rig, BOARD.points, 0, THICK, board, AS_DRAWN).covariance - rig.covariance
+    return rig, with_tolerances(rig, BOARD.points, THICK, board, AS_DRAWN).covariance - rig.covariance
 
 
 def test_longer_squares_make_everything_longer():
@@ -48,8 +48,8 @@ def test_a_thicker_board_lifts_the_table():
 
 
 def test_without_a_table_view_only_the_scale_is_uncertain():
-    rig, tolerances = rig_of(Scene()), BoardTolerances(square=2e-4)
-    added = with_tolerances(rig, BOARD.points, None, THICK, tolerances, AS_DRAWN).covariance - rig.covariance
+    rig, tolerances = replace(rig_of(Scene()), world_is_table=False), BoardTolerances(square=2e-4)
+    added = with_tolerances(rig, BOARD.points, THICK, tolerances, AS_DRAWN).covariance - rig.covariance
     assert_allclose(np.delete(np.delete(added, np.s_[21:24], 0), np.s_[21:24], 1), 0.0, atol=0)
     assert added.shape == (N_RIG, N_RIG)
     assert_allclose(np.sqrt(2 * np.trace(added)), 2e-4 * rig.baseline)
@@ -77,9 +77,9 @@ def test_stretch_and_bow_are_seen_by_the_views(rng):
     sigma = 4 * np.sqrt(rig.covariance[21, 21]) / truth
     assert_allclose(np.linalg.norm(refinement.model.rig.t_right_left) / truth - 1, -1e-4, atol=sigma + 2e-5)
     # and the world's origin lies below corner 0
-    corner = refinement.model.points[0] - on_the_table(BOARD.points, shape)
+    corner = refinement.model.points[0] - shape.origin
     assert_allclose(corner[:2], 0.0, atol=4 * (shape.stretch_sigma * 0.032 + 0.005 * 0.25e-3))
-    told = with_tolerances(rig, BOARD.points, 0, THICK, BoardTolerances(), shape).allowances
+    told = with_tolerances(rig, BOARD.points, THICK, BoardTolerances(), shape).allowances
     size = np.linalg.norm(told[0].shift[21:24]) / rig.baseline
     assert_allclose(size, 1e-4, rtol=0.3)  # as large as the error is
 
@@ -88,11 +88,11 @@ def test_stretch_and_bow_are_seen_by_the_views(rng):
 def test_a_board_that_looks_exact_is_taken_for_exact(seed):
     *_, shape, rig = found_shape(np.random.default_rng(seed))
     assert abs(shape.stretch) < 4 * shape.stretch_sigma < 5e-5
-    told = with_tolerances(rig, BOARD.points, 0, THICK, BoardTolerances(), shape).allowances
+    told = with_tolerances(rig, BOARD.points, THICK, BoardTolerances(), shape).allowances
     assert np.linalg.norm(told[0].shift[21:24]) / rig.baseline < 3 * shape.stretch_sigma
     assert next(a.cause for a in told if a.assumed) == "the board's thickness"
     # what was declared counts as declared
-    declared = with_tolerances(rig, BOARD.points, 0, THICK, BoardTolerances(2e-4, 20e-6, 0.0), shape)
+    declared = with_tolerances(rig, BOARD.points, THICK, BoardTolerances(2e-4, 20e-6, 0.0), shape)
     assert_allclose(np.linalg.norm(declared.allowances[0].shift[21:24]), 2e-4 / np.sqrt(2) * rig.baseline)
     assert not any(a.assumed for a in declared.allowances)
     grown = replace(rig, covariance=declared.covariance - sum(np.outer(a.shift, a.shift) for a in declared.allowances))

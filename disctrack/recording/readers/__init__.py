@@ -29,6 +29,7 @@ def open_frames(pattern: str, folder: str | Path, camera: str) -> FrameReader:
         raise RecordingError(f"{files[0]}: {NUMBER} in a pattern numbers images of a file each; leave it out here.")
     opener = getattr(import_module(f"disctrack.recording.readers.{module}"), f"open_{module}")
     reader: FrameReader = opener(files, camera, member) if member else opener(files, camera)
+    reader.camera = camera
     reader.notes, reader.doubts = (
         tuple(f"{camera} camera: {sentence}" for sentence in words) for words in (reader.notes, reader.doubts)
     )

@@ -68,7 +68,7 @@ class FrameReader:
         ((272, 272), (272, 272))
     """
 
-    camera: str  # left or right
+    camera: str = ""  # left or right, as `open_frames` was told
     files: Sequence[object]  # file of each frame, for messages
     image_size: tuple[int, int]  # width, height [px]
     dtype: np.dtype  # of grey values in memory

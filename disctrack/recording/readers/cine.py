@@ -48,7 +48,6 @@ def open_cine(files: Sequence[Path], camera: str) -> FrameReader:
     times, step, doubts = _times(cine)
     header = _header(cine, times, step)
     return raw_frames(
-        camera=camera,
         files=[file] * n,
         offsets=_pixels(cine, starts, layout),
         layout=layout,

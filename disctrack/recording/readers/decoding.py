@@ -37,8 +37,7 @@ def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
     if content.startswith(_PNG_SIGNATURE):
         return _png(content, where, out)
     if content[:4] in _TIFF_SIGNATURES:
-        source = RawFile(Path(where), content)
-        return page_pixels(source, next(pages_of(source)), where)
+        return page_pixels(next(pages_of(RawFile(Path(where), content))), where)
     _check_length(content, where)
     return _by_opencv(content, where)
 

@@ -30,7 +30,7 @@ def open_hdf5(files: Sequence[Path], camera: str, member: str = "") -> FrameRead
         handle = h5py.File(file, "r", rdcc_nbytes=_LARGEST_CACHE, rdcc_w0=1.0)
     try:
         with told_as(RecordingError, f"{file}: the HDF5 file is damaged", Exception, then="Copy it again."):
-            return _open(handle, _stack(handle, member, file), file, camera)
+            return _open(handle, _stack(handle, member, file), file)
     except RecordingError:
         handle.close()
         raise
@@ -64,7 +64,7 @@ def stacks_of(handle: h5py.File) -> list[h5py.Dataset]:
     return found
 
 
-def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> FrameReader:
+def _open(handle: h5py.File, stack: h5py.Dataset, file: Path) -> FrameReader:
     (n, height, width), where = stack.shape, f"{file}:{stack.name}"
     check_frame_size(width, height, where)
     most = 4 * raw.MOST_PIXELS  # bytes: the library reads whole chunks, whatever the file's size
@@ -81,7 +81,6 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path, camera: str) -> Fr
     _check_other_files(stack, file, where)
     rate, bits = _attribute(stack, "frame_rate"), _attribute(stack, "bit_depth")
     common: dict[str, Any] = {
-        "camera": camera,
         "bit_depth": bit_depth_of(8 * stack.dtype.itemsize, int(bits or 0)),
         "timestamps": _timestamps(stack, n, where),
         "frame_rate": rate if rate is not None and rate > 0 else None,

@@ -52,7 +52,6 @@ def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameR
     whole, first = first_readable(len(files), camera, looked_at)
     alike = f"images are stored with {whole.shape[-1]} channels of equal value; one is used, without loss"
     return FrameReader(
-        camera=camera,
         files=[file or f"missing file of {camera} frame {index}" for index, file in enumerate(slots)],
         numbers=numbers,
         image_size=(first.shape[1], first.shape[0]),
@@ -80,33 +79,27 @@ def _open_stack(files: Sequence[Path], camera: str) -> FrameReader:
 
     The frame rate is taken from the description by ImageJ or OME in the first page, time stamps from that by OME.
     """
-    pages: list[Page] = []
-    sources: list[RawFile] = []
-    notes = []
-    for file in map(RawFile, files):
-        found, note = _pages(file)
-        pages += found
-        sources += [file] * len(found)
-        notes += [note] if note else []
+    stacks = [_pages(RawFile(file)) for file in files]
+    pages = [page for found, _ in stacks for page in found]
     first = pages[0]
     rate, stamps = _times(first.description, len(pages))
     check_frame_size(first.plain.width, first.plain.height, str(files[0]))
-    common: dict[str, Any] = {"camera": camera, "files": sources, "notes": tuple(notes)}
-    common |= {"timestamps": stamps, "frame_rate": rate}
+    common: dict[str, Any] = {"files": [page.source for page in pages]}
+    common |= {"timestamps": stamps, "frame_rate": rate, "notes": tuple(note for _, note in stacks if note)}
     beyond = 2**62  # the end of any file: offsets in a damaged directory may exceed 64 bits
     offsets = np.array([min(page.plain_offset, beyond) for page in pages], np.int64)
     if (offsets >= 0).all() and all(page.coding == first.coding for page in pages):
         return raw_frames(offsets=offsets, layout=first.plain, **common)
 
     def pixels(index: int, out: Image | None, where: str) -> Image:
-        return as_grey(page_pixels(sources[index], pages[index], where), where)
+        return as_grey(page_pixels(pages[index], where), where)
 
-    image = first_readable(len(pages), camera, lambda index: pixels(index, None, str(sources[index])))
+    image = first_readable(len(pages), camera, lambda index: pixels(index, None, str(pages[index].source)))
     return FrameReader(
         image_size=(image.shape[1], image.shape[0]),
         dtype=image.dtype,
         decoded=pixels,
-        stored=lambda index: pages[index].coding.encode() + b"".join(pages[index].pieces(sources[index], "")),
+        stored=lambda index: pages[index].coding.encode() + b"".join(pages[index].pieces("")),
         **common,
     )
 
@@ -123,11 +116,11 @@ def _pages(file: RawFile) -> tuple[list[Page], str | None]:
             raise
         note = f"only {len(pages)} pages are whole ({error})"
     if len(pages) == 1:
-        pages = _without_directories(file, pages[0])
+        pages = _without_directories(pages[0])
     return pages, note
 
 
-def _without_directories(file: RawFile, first: Page) -> list[Page]:
+def _without_directories(first: Page) -> list[Page]:
     """All frames of a file with one directory, as in stacks by ImageJ: they follow the first without a gap."""
     n, size = _pages_announced(first.description), first.plain.frame_bytes
     if n < 2 or size == 0:
@@ -135,8 +128,8 @@ def _without_directories(file: RawFile, first: Page) -> list[Page]:
     if first.plain_offset < 0:
         plain = "grey values of 8 or 16 bit, black as zero, upright, not compressed"
         said = f"announces {n} frames in one directory, whose pixels are not plain; expected {plain}"
-        raise RecordingError(f"{file}: {said}. Export it again.")
-    most = max(1, -(-file.size // size))  # a truncated file has the frames that begin in it
+        raise RecordingError(f"{first.source}: {said}. Export it again.")
+    most = max(1, -(-first.source.size // size))  # a truncated file has the frames that begin in it
     start = first.plain_offset
     return [replace(first, places=(start + i * size,), sizes=(size,)) for i in range(min(n, most))]
 

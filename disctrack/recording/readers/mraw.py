@@ -64,7 +64,6 @@ def open_mraw(files: Sequence[Path], camera: str) -> FrameReader:
         notes.append(f"{data_file.name} is longer than the {n} frames of its header; what follows them is not read")
     header, remarks, doubts = _header(entries)
     return raw_frames(
-        camera=camera,
         files=[file] * n,
         offsets=np.arange(n, dtype=np.int64) * layout.frame_bytes,
         layout=layout,

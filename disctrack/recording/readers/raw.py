@@ -130,12 +130,7 @@ class PixelLayout:
 
 
 def raw_frames(
-    camera: str,
-    files: Sequence[RawFile],
-    offsets: NDArray[np.integer],
-    layout: PixelLayout,
-    notes: tuple[str, ...] = (),
-    **others: Any,
+    files: Sequence[RawFile], offsets: NDArray, layout: PixelLayout, notes: tuple[str, ...] = (), **others: Any
 ) -> FrameReader:
     """Frames of equal size at known offsets in one or several files.
 
@@ -162,7 +157,6 @@ def raw_frames(
         return image if layout.dtype.isnative else image.byteswap(inplace=True)
 
     return FrameReader(
-        camera=camera,
         files=files,
         image_size=image_size,
         dtype=dtype,

@@ -29,6 +29,7 @@ _CODING = (256, 257, 258, 259, 262, 266, 274, 277, 278, 284, 317, 320, 322, 323,
 class Page:
     """One page: offsets and coding of its strips or tiles."""
 
+    source: RawFile
     places: tuple[int, ...]  # byte offsets of strips or tiles
     sizes: tuple[int, ...]  # [bytes]
     coding: str  # all tags that determine the decoding of the pixels
@@ -53,9 +54,9 @@ class Page:
         one = len(self.places) == 1
         return self.places[0] if one or (follow and sum(self.sizes) == plain.frame_bytes) else -1
 
-    def pieces(self, source: RawFile, where: str) -> list[bytes]:
+    def pieces(self, where: str) -> list[bytes]:
         """Stored bytes of the strips or tiles. Raises RecordingError."""
-        return [source.bytes_at(a, n, where) for a, n in zip(self.places, self.sizes, strict=True)]
+        return [self.source.bytes_at(a, n, where) for a, n in zip(self.places, self.sizes, strict=True)]
 
 
 def pages_of(source: RawFile) -> Iterator[Page]:
@@ -75,7 +76,7 @@ def pages_of(source: RawFile) -> Iterator[Page]:
             if not isinstance(page, tifffile.TiffPage):  # lightweight pages, which tifffile makes on request only
                 raise TypeError("no page of its own")
             seen.add(page.offset)
-            found = _page(page, first)
+            found = _page(source, page, first)
             if not page.subfiletype & tifffile.FILETYPE.REDUCEDIMAGE:
                 frames += 1
                 yield found
@@ -86,26 +87,26 @@ def pages_of(source: RawFile) -> Iterator[Page]:
             raise RecordingError(f"{source}: the chain of pages breaks off, it is damaged. Copy it again.")
 
 
-def _page(page: tifffile.TiffPage, first: dict[str, tifffile.TiffPage]) -> Page:
+def _page(source: RawFile, page: tifffile.TiffPage, first: dict[str, tifffile.TiffPage]) -> Page:
     if int(page.imagewidth) < 0 or int(page.imagelength) < 0 or len(page.dataoffsets) != len(page.databytecounts):
         raise ValueError(f"the directory at byte {page.offset}")
     coding = page.parent.byteorder + repr([page.tags.valueof(code) for code in _CODING])
     places, sizes = (tuple(map(int, numbers)) for numbers in (page.dataoffsets, page.databytecounts))
-    return Page(places, sizes, coding, first.setdefault(coding, page), page.description)
+    return Page(source, places, sizes, coding, first.setdefault(coding, page), page.description)
 
 
 def _orientation(page: tifffile.TiffPage) -> int:
     return int(page.tags.valueof(274, default=1))
 
 
-def page_pixels(source: RawFile, page: Page, where: str) -> NDArray:
+def page_pixels(page: Page, where: str) -> NDArray:
     """Pixels of a page, (height, width) or (height, width, channels), upright, with black as 0 and palettes applied.
 
     Raises RecordingError that begins with `where`.
     """
     with told_as(RecordingError, f"{where}: the page is damaged", Exception, then="Copy or export it again."):
         _check(page, where)
-        return np.ascontiguousarray(_decoded(page.like, page.pieces(source, where)))
+        return np.ascontiguousarray(_decoded(page.like, page.pieces(where)))
 
 
 def _check(page: Page, where: str) -> None:

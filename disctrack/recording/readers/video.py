@@ -51,7 +51,6 @@ def open_video(files: Sequence[Path], camera: str) -> FrameReader:
     frame, first = first_readable(len(video.times), camera, looked_at)
     lossy = f"{video.codec} may compress with loss, which costs accuracy; ffv1 is free of loss"
     return FrameReader(
-        camera=camera,
         files=[file] * len(video.times),
         image_size=(first.shape[1], first.shape[0]),
         dtype=first.dtype,
