@@ -367,6 +367,8 @@ def read_beside_cameras(group: h5py.Group, of_cameras: Iterable[Sequence[NDArray
         raise RigFileError(f"{group.name}/covariance is not a covariance")
     if "lens_field" in values:
         values["lens_field"] = LensField(values["lens_field"], float(values.pop("lens_field_spacing")))
+        if min(values["lens_field"].coefficients.shape[2:]) < 4 or not values["lens_field"].spacing > 0:
+            raise RigFileError(f"{group.name}/lens_field is not a field of splines")
     if "allowances" in values:
         shifts, marks = values["allowances"], group["allowances"].attrs
         rows = zip(json.loads(marks["causes"]), shifts, json.loads(marks["assumed"]), strict=True)
