@@ -37,29 +37,16 @@ COORDINATES = ("x", "y", "z", "psi", "theta", "phi")
 CAMERAS = ("left", "right")
 
 
-def rotation_x(angle: ArrayLike) -> Array:
-    """Rotation about the first axis; angle (...) [rad] -> (..., 3, 3)."""
-    return _axis_rotation(angle, 1, 2)
+def rotation_from_euler(psi: ArrayLike, theta: ArrayLike, phi: ArrayLike) -> Array:
+    """R_world_body = Rz(psi) Rx(theta) Rz(phi); angles (...) [rad], wrapped or not -> (..., 3, 3)."""
+    e1, e2, e3 = nodal_axes_world(psi, theta)
+    s, c = np.sin(phi)[..., None], np.cos(phi)[..., None]
+    return np.stack(np.broadcast_arrays(c * e1 + s * e2, c * e2 - s * e1, e3), axis=-1)
 
 
 def rotation_z(angle: ArrayLike) -> Array:
     """Rotation about the third axis; angle (...) [rad] -> (..., 3, 3)."""
-    return _axis_rotation(angle, 0, 1)
-
-
-def _axis_rotation(angle: ArrayLike, i: int, j: int) -> Array:
-    angle = np.asarray(angle, float)
-    R = np.zeros((*angle.shape, 3, 3))
-    R[..., 0, 0] = R[..., 1, 1] = R[..., 2, 2] = 1.0
-    R[..., i, i] = R[..., j, j] = np.cos(angle)
-    R[..., j, i] = np.sin(angle)
-    R[..., i, j] = -R[..., j, i]
-    return R
-
-
-def rotation_from_euler(psi: ArrayLike, theta: ArrayLike, phi: ArrayLike) -> Array:
-    """R_world_body = Rz(psi) Rx(theta) Rz(phi); angles (...) [rad], wrapped or not -> (..., 3, 3)."""
-    return rotation_z(psi) @ rotation_x(theta) @ rotation_z(phi)
+    return rotation_from_euler(0.0, 0.0, angle)
 
 
 def euler_from_rotation(R_world_body: Array) -> Array:
