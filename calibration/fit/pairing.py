@@ -13,12 +13,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.board.chessboard import BoardNotFound, CornerView
 from calibration.cameras.camera import CAMERA_NAMES, Camera, by_turning, project_with_jacobians, vector_from_rotation
 from calibration.fit.stereo_model import Observations, StereoModel
-from calibration.kit.arrays import Array, Mask, evenly
+from calibration.kit.arrays import AnyArray, Array, Indices, Mask, evenly
 from calibration.kit.errors import CalibrationError
 
 FLOOR = 1e-3  # of the image's longer side: accuracy of poses by rough cameras; views that differ by less are identical
@@ -47,7 +46,7 @@ class BoardPoses:
     middle: Array  # (n, 3) [m] of the board
     covariance: Array  # (n, 6, 6) of rotation and shift of the middle, for 1 px of noise, times the number of points
 
-    def __getitem__(self, index: NDArray) -> BoardPoses:
+    def __getitem__(self, index: AnyArray) -> BoardPoses:
         return BoardPoses(self.R[index], self.middle[index], self.covariance[index])
 
     def turned(self, turn: Array, mirror: bool = False) -> BoardPoses:
@@ -136,7 +135,7 @@ class Pairs:
     """Which views are pairs: their two images, each with its own pose of the board, agree with the other pairs."""
 
     model: StereoModel  # with a pose of the board for each image alone
-    views: NDArray[np.intp]  # with such poses in both images
+    views: Indices  # with such poses in both images
     odd: dict[int, str] = field(default_factory=dict)  # view -> why its two images are no pair
     bad_images: dict[tuple[int, int], str] = field(default_factory=dict)  # (view, camera) -> why it is not used at all
     # If a camera was moved between views: the stretches of pairs before and after each step; and for each step its
@@ -172,7 +171,7 @@ class Pairing:
 
     R_right_left: Array  # (3, 3)
     t_right_left: Array  # (3,) [m]
-    order: NDArray[np.intp]  # (n,) index of the board's symmetry in the right image of each pair
+    order: Indices  # (n,) index of the board's symmetry in the right image of each pair
     distance: Array  # (n,) [px]
     evidence: float  # mean log likelihood of the pairs
     floor: float  # [px]
@@ -235,7 +234,7 @@ def paired(
     mirrored = [right.turned(turn @ np.diag([-1.0, 1.0, 1.0]), True) for turn in board_turns(4 if is_square else 2)]
     place = [{view: i for i, view in enumerate(side)} for side in views]
 
-    def pairs_of(right_of: NDArray, among: Sequence[int] = views[0], turns: Sequence[BoardPoses] = as_seen) -> Paired:
+    def pairs_of(right_of: AnyArray, among: Sequence[int] = views[0], turns: Sequence[BoardPoses] = as_seen) -> Paired:
         both = [v for v in among if right_of[v] in place[1]]
         b = np.array([place[1][right_of[v]] for v in both], int)
         return both, left[np.array([place[0][v] for v in both], int)], [one[b] for one in turns]
@@ -299,7 +298,7 @@ def _require_agreement(stored: Pairing, others: Sequence[float]) -> None:
 
 
 def _late(
-    pairs_of: Callable[[NDArray, Sequence[int]], Paired], odd: Sequence[int], found: Pairing, names: Names
+    pairs_of: Callable[[AnyArray, Sequence[int]], Paired], odd: Sequence[int], found: Pairing, names: Names
 ) -> tuple[str, ...]:
     """Warnings about pairs among the `odd` that would agree with a later or an earlier right view."""
     rest, notes = list(odd), []

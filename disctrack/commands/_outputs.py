@@ -7,9 +7,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from numpy.typing import NDArray
-
 from calibration import StereoRig
+from calibration.kit.arrays import AnyArray
 from disctrack.calibrate.stage import boards_in
 from disctrack.commands import DONE, INCOMPLETE
 from disctrack.files.json_text import json_text
@@ -156,7 +155,7 @@ def _companions(
         yield video
 
 
-def pair_of(pairs: ImagePairs, row: int) -> NDArray:
+def pair_of(pairs: ImagePairs, row: int) -> AnyArray:
     """Both images of a frame (2, height, width); one that cannot be read is black."""
     (block,) = iter_pair_blocks(pairs.left, pairs.right, row, row + 1)
     return block.images[0]

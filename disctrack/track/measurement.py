@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import FrameRate, Gravity, Threads, Times, checked, grey_values
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import AnyArray, Array
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.declaration import Boards, contradictions, with_square
 from disctrack.disc import Disc
@@ -35,7 +34,7 @@ from disctrack.trajectory import FrameStatus, at_full_length
 from disctrack.trajectory.file import Provenance
 
 Progress = Callable[[int], None]
-Images = NDArray[np.generic]  # of any real type; uint8 and uint16 are not copied
+Images = AnyArray  # of any real type; uint8 and uint16 are not copied
 
 WHOLE_BELOW = 2.0  # [s] shorter recordings were cut by the user, and are measured including rest
 BLOCK = 64  # pairs in memory

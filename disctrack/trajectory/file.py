@@ -18,11 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import RIG_PARAMETERS, StereoRig
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Mask
+from calibration.kit.arrays import AnyArray, Mask
 from calibration.kit.brief import Brief
 from calibration.kit.seal import sealed
 from calibration.rig_file import beside_cameras, complete_file, read_beside_cameras, versions, write_attributes
@@ -241,7 +240,7 @@ def write_groups(path: Path, groups: Mapping[str, Group], axes: Mapping[str, Var
 @checked
 def read_group(
     path: str | Path, group: str, names: Collection[str] | None = None
-) -> tuple[dict[str, NDArray], dict[str, Any]]:
+) -> tuple[dict[str, AnyArray], dict[str, Any]]:
     """Arrays and attributes of one group. Raises TrajectoryFileError that lists the groups of the file.
 
     names : of the arrays to read; by default all
@@ -463,7 +462,7 @@ def _trajectory(file: h5py.File) -> Trajectory:
     return trajectory
 
 
-def _array(file: h5py.File, place: str, unit: str) -> NDArray:
+def _array(file: h5py.File, place: str, unit: str) -> AnyArray:
     """Values of a dataset. Raises ValueError if their unit is not the one that this program writes."""
     found = str(file[place].attrs.get("units", unit))
     if found != unit:

@@ -10,10 +10,9 @@ from itertools import combinations, permutations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig, normalise, triangulate
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import AnyArray, Array
 from calibration.kit.grey_levels import level_step
 from disctrack.analyse.declaration import SIDE_TOLERANCE
 from disctrack.disc import Disc
@@ -30,7 +29,7 @@ CANDIDATES = 40  # poses that are refined
 Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]
 
 
-def dot_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Array:
+def dot_blobs(image: AnyArray, expected_diameter_px: float) -> Array:
     """Centroids and areas (k, 3) of elliptical blobs, dark on light and light on dark, most elliptical first.
 
     x, y [px], area [px^2]. The threshold is relative to the local mean, so uneven light does not matter. The area of a
@@ -50,7 +49,7 @@ def dot_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Array:
     return np.array([blob[1:] for blob in found[:MAX_BLOBS]], float).reshape(-1, 3)
 
 
-def _elliptical_components(mask: NDArray[np.uint8], diameter: float) -> list[tuple[float, float, float, float]]:
+def _elliptical_components(mask: AnyArray, diameter: float) -> list[tuple[float, float, float, float]]:
     contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     result = []
     for contour in contours:
@@ -81,7 +80,7 @@ def expected_diameter_px(rig: StereoRig, disc: Disc) -> list[float]:
 
 
 def acquire(
-    pair: Sequence[NDArray] | NDArray, rig: StereoRig, disc: Disc, by_one: bool = True
+    pair: Sequence[AnyArray] | AnyArray, rig: StereoRig, disc: Disc, by_one: bool = True
 ) -> tuple[Pose | None, int, str]:
     """Find the disc in the images of both cameras, at any position and attitude.
 
@@ -115,7 +114,7 @@ def acquire_from_blobs(
 
 
 def seen_by_one_camera(
-    image: NDArray[np.generic], camera: int, diameter_px: float, rig: StereoRig, disc: Disc
+    image: AnyArray, camera: int, diameter_px: float, rig: StereoRig, disc: Disc
 ) -> tuple[Array, Array, Array]:
     """Dots identified by one camera among blobs of about this diameter, and the pose R_world_body, t_world_body.
 

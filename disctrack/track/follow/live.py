@@ -7,11 +7,10 @@ of the dots, their scatter) is not known yet: so use a disc that was measured be
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import checked, grey_values
-from calibration.kit.arrays import Array, Image
+from calibration.kit.arrays import AnyArray, Array, Image
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.errors import ArgumentError
@@ -91,7 +90,7 @@ class Tracker:
         follow_block(self._follower, images, np.ones((1, 2), bool), rows, 0)
         return self._pose(rows)
 
-    def _as_block(self, left: Image, right: Image) -> NDArray:
+    def _as_block(self, left: Image, right: Image) -> AnyArray:
         left, right = grey_values(left, "left"), grey_values(right, "right")
         if left.dtype != right.dtype or left.shape != right.shape or left.ndim != 2:
             raise ArgumentError(

@@ -5,10 +5,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig, causes
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import AnyArray, Array, Codes, Mask
 from calibration.kit.brief import Brief
 from disctrack import frames
 from disctrack.findings import Finding
@@ -127,7 +126,7 @@ def assemble(
 
 
 def _correct_dots(
-    seen: DotsInFrames, dots: NDArray, first: Follower, settings: TrackingSettings, taken: Taken
+    seen: DotsInFrames, dots: AnyArray, first: Follower, settings: TrackingSettings, taken: Taken
 ) -> tuple[tuple[float, float], tuple[Finding, ...]]:
     """Correct the dots for exposure, glare and lens field; returns the exposure [s] and findings about it.
 
@@ -207,7 +206,7 @@ def _shared_sigma(fits: PoseFits, systematic: Array, rig: StereoRig, moved: Arra
     return [[float(value), cause] for value, cause in zip(sigma, most, strict=True)]
 
 
-def status_of(followed: NDArray[np.uint8], fits: PoseFits) -> NDArray[np.uint8]:
+def status_of(followed: Codes, fits: PoseFits) -> Codes:
     """(n,) status by the fits of frames in which the disc was followed; the others keep their status."""
     status, was = followed.copy(), followed == FrameStatus.MEASURED
     per_camera = fits.used.sum(axis=2)
@@ -222,8 +221,8 @@ def trajectory_of(
     seen: DotsInFrames,
     fits: PoseFits,
     systematic: Array,
-    status: NDArray[np.uint8],
-    located: NDArray[np.uint8],
+    status: Codes,
+    located: Codes,
     taken: Taken,
 ) -> Trajectory:
     """The trajectory of the fitted poses; rejected poses become NaN in the arrays of `fits`, too.

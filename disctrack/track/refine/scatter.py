@@ -16,10 +16,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import INTRINSIC_PARAMETERS, N_RIG, PAIR_SHIFT
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Indices
 from disctrack.analyse.derivatives import CHANNELS
 from disctrack.track.judge.outlier_tests import differences, sums_over_time
 from disctrack.track.pose import DotsInFrames, PoseFits, whitening
@@ -154,7 +153,7 @@ def scatter_of_poses(fits: PoseFits) -> tuple[Array, Array, Array]:
     return found, sigma, factor
 
 
-def _precession(R: Array, rows: NDArray[np.intp]) -> Array:
+def _precession(R: Array, rows: Indices) -> Array:
     """Largest precession [rad per frame] in the seven frames around each of the rows."""
     axis = R[rows[:, None] + np.arange(-3, 4), :2, 2]
     tilt = np.linalg.norm(axis, axis=2)
