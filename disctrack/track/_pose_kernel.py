@@ -1,7 +1,5 @@
 """Compiled fit of poses to their dots (numba): Levenberg-Marquardt, one frame after the other; see `pose`."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

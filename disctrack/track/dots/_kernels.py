@@ -9,8 +9,6 @@ it calls. So there are few functions; slices are not assigned (the error message
 takes longer to compile than a loop); and only functions that Python calls are Python entry points.
 """
 
-from __future__ import annotations
-
 import math
 from collections import namedtuple
 from typing import NamedTuple
