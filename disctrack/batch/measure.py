@@ -4,8 +4,6 @@ The numbers of its row are in SI units and have sigmas; unknown numbers are NaN,
 """
 
 import contextlib
-import hashlib
-import json
 import time
 from pathlib import Path
 
@@ -27,7 +25,7 @@ from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.recorded import wrong_declarations
 from disctrack.discrepancy.fit import fit
 from disctrack.errors import AnalysisError, DiscTrackError, TrackingError, reason_of
-from disctrack.files.json_text import plain
+from disctrack.files.json_text import json_sha256, plain
 from disctrack.findings import Kind, leading
 from disctrack.frames import CAMERAS, COORDINATES
 from disctrack.recording.declaration import read_recording
@@ -88,7 +86,7 @@ def make_recording(job: Job, results: Path) -> Row:
         "name": recording.name,
         "repeats": group_of(recording),
         "rig": job.rig,
-        "input_sha256": hashlib.sha256(json.dumps(dict(provenance.inputs), sort_keys=True).encode()).hexdigest(),
+        "input_sha256": json_sha256(dict(provenance.inputs)),
         "fingerprint": provenance.fingerprint,
         "version": provenance.version,
         "seconds": round(time.perf_counter() - began, 3),

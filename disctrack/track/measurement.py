@@ -1,12 +1,9 @@
 """The complete measurement: a recording's files, or frames in memory, become a trajectory with its provenance."""
 
-import dataclasses
-import hashlib
-import json
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +15,7 @@ from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.declaration import Boards, contradictions, with_square
 from disctrack.disc import Disc
 from disctrack.errors import RecordingError, TrackingError
+from disctrack.files.json_text import json_sha256
 from disctrack.findings import Finding, Kind, Severity, of_kind, warn_of_doubts
 from disctrack.frames import CAMERAS
 from disctrack.progress import compiling
@@ -140,9 +138,9 @@ def measure(
     """
     check_rig(rig, pairs)
     exposure, headers = exposures(recording, pairs)
-    settings = dataclasses.replace(settings or TrackingSettings(), exposure=exposure)
+    settings = replace(settings or TrackingSettings(), exposure=exposure)
     if recording.table is not None:
-        settings = dataclasses.replace(settings, table=recording.table.source)
+        settings = replace(settings, table=recording.table.source)
     stamps = usable_times(pairs.left, recording.frame_rate)
     with compiling("tracking", 15):  # once per installation, not counted as measuring time
         prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)
@@ -161,15 +159,15 @@ def measure(
     details = {
         **found.details,
         "unreadable": [*found.unreadable.values()],
-        "first_pass": dataclasses.asdict(span),
+        "first_pass": asdict(span),
         **pairs.camera_headers(),
     }
     trajectory = at_full_length(found.trajectory, len(pairs.left), span.start, stamps)
     for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
         trajectory.frame_status[still] = FrameStatus.STILL
-    trajectory = dataclasses.replace(trajectory, air_density=recording.air_density)
+    trajectory = replace(trajectory, air_density=recording.air_density)
     findings = contradictions(trajectory, recording.disc, recording, findings, boards, details["blur_px"])
-    trajectory = dataclasses.replace(trajectory, findings=findings)
+    trajectory = replace(trajectory, findings=findings)
     warn_of_doubts(findings)
     return Measurement(trajectory, details, found.unreadable, seconds)
 
@@ -224,7 +222,7 @@ def measure_pairs(
     seconds = time.perf_counter() - began
     findings = contradictions(found.trajectory, disc, noticed=found.trajectory.findings)
     warn_of_doubts(findings)
-    return Measurement(dataclasses.replace(found.trajectory, findings=findings), found.details, seconds=seconds)
+    return Measurement(replace(found.trajectory, findings=findings), found.details, seconds=seconds)
 
 
 def _sides(images: Images | tuple[Images, Images]) -> tuple[Images, Images]:
@@ -268,7 +266,7 @@ def _tracked(
         refuse_unreadable(recording, not_read, 2 * len(tracked), error)
         error.findings = with_square(error.findings, recording)
         raise
-    return dataclasses.replace(found, unreadable=dict(sorted(not_read.items())))
+    return replace(found, unreadable=dict(sorted(not_read.items())))
 
 
 def images_lost(not_read: NotRead) -> tuple[Finding, ...]:
@@ -323,17 +321,11 @@ def trajectory_provenance(
     """
     return Provenance(
         recording=recording.name,
-        inputs={**pairs.inputs(), "rig": rig_sha256(rig)},
+        inputs={**pairs.inputs(), "rig": json_sha256(rig)},
         settings={
             "recording": dict(recording.declared),
             "frames": [pairs.start, pairs.stop],
-            "tracking": dataclasses.asdict(settings or TrackingSettings()),
+            "tracking": asdict(settings or TrackingSettings()),
             **pairs.camera_headers(),
         },
     )
-
-
-def rig_sha256(rig: StereoRig) -> str:
-    """SHA-256 (hex) of all numbers of a rig, at full precision."""
-    numbers = json.dumps(dataclasses.asdict(rig), default=lambda value: value.tolist())
-    return hashlib.sha256(numbers.encode()).hexdigest()

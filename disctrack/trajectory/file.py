@@ -7,7 +7,6 @@ reprojection_rms_px, status; groups `markers`, `disc`, `calibration`, and those 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
 import json
 import platform
@@ -27,7 +26,7 @@ from calibration.kit.seal import sealed
 from calibration.rig_file import beside_cameras, complete_file, read_beside_cameras, versions, write_attributes
 from disctrack.disc import Disc
 from disctrack.errors import OutputError, TrajectoryFileError, told_as
-from disctrack.files.json_text import json_text
+from disctrack.files.json_text import json_sha256, json_text
 from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_array, write_variables
 from disctrack.files.software import software_version
 from disctrack.files.whole import refuse_existing, write_whole
@@ -77,8 +76,7 @@ class Provenance(Brief):
     @property
     def fingerprint(self) -> str:
         """SHA-256 (hex) of inputs, settings and version."""
-        content = {"inputs": dict(self.inputs), "settings": dict(self.settings), "version": self.version}
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+        return json_sha256({"inputs": dict(self.inputs), "settings": dict(self.settings), "version": self.version})
 
 
 @checked
