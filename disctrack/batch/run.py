@@ -6,7 +6,6 @@ The summary has one row per recording, as JSON and as CSV, merged from all proce
 import contextlib
 import csv
 import io
-import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -26,7 +25,7 @@ from disctrack.errors import AnalysisError, ArgumentError, ClusterError, OutputE
 from disctrack.files.json_text import json_file
 from disctrack.files.software import __version__
 from disctrack.files.text import csv_cell
-from disctrack.files.whole import check_writable, write_whole
+from disctrack.files.whole import check_writable, seen_from, write_whole
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.progress import progress_bar
 from disctrack.recording.declaration import FILE_NAME
@@ -117,7 +116,7 @@ def run_batch(
         records.setdefault(job.name, outcome(NOT_MEASURED, stopped))
     whole = shard is None  # only then the diagnosis of all together is made here
     done = _summed_up(found, mine, records, options, stopped == INTERRUPTED, n if whole else 0)
-    return replace(done, undeclared=tuple(os.path.relpath(place, found.base) for place in undeclared))
+    return replace(done, undeclared=tuple(str(seen_from(found.base, place)) for place in undeclared))
 
 
 def summarise_batch(
@@ -204,7 +203,7 @@ def rows_of(found: FoundRecordings, records: Mapping[str, Row]) -> list[Row]:
         row: Row = {column: known.get(column) for column in COLUMNS} | {"recording": name}
         paths = {what: results / row[what] for what in PATHS if row[what]} | {"folder": folder}
         paths |= {"rig": Path(row["rig"])} if row["rig"] else {}
-        rows.append(row | {what: _relative(path, found.common) for what, path in paths.items()})
+        rows.append(row | {what: seen_from(found.common, path).as_posix() for what, path in paths.items()})
     return rows
 
 
@@ -220,13 +219,6 @@ def _on_the_disk(folder: Path, results: Path) -> Row:
     changed = changed_since(folder, read_provenance(results / row["trajectory"]).declared)
     stale = f"{FILE_NAME} has changed: {changed}; the batch without --summary-only measures it anew" if changed else ""
     return row | outcome(SKIPPED, "; ".join(filter(None, [stale, row["reason"]])))
-
-
-def _relative(path: Path, folder: Path) -> str:
-    try:
-        return Path(os.path.relpath(path, folder)).as_posix()
-    except ValueError:  # another drive
-        return path.as_posix()
 
 
 def write_summary(

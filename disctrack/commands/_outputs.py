@@ -1,7 +1,6 @@
 """Common parts of the commands: options, checks, reports and output files."""
 
 import argparse
-import os
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,6 +12,7 @@ from disctrack.calibrate.stage import boards_in
 from disctrack.commands import DONE, INCOMPLETE
 from disctrack.files.json_text import json_text
 from disctrack.files.whole import check_writable as check_writable
+from disctrack.files.whole import seen_from
 from disctrack.findings import Kind, Severity, in_doubt, leading, of_kind
 from disctrack.progress import progress_bar
 from disctrack.recording.declaration import FILE_NAME, Recording
@@ -163,8 +163,4 @@ def pair_of(pairs: ImagePairs, row: int) -> AnyArray:
 
 def relative(path: Path) -> Path:
     """The shorter of the path and its form relative to the working folder."""
-    try:
-        short = Path(os.path.relpath(path))
-    except ValueError:  # another drive
-        return path
-    return min(short, path, key=lambda p: len(str(p)))
+    return min(seen_from(Path(), path), path, key=lambda p: len(str(p)))
