@@ -178,17 +178,10 @@ def fit_all(seen: DotsInFrames, workers: int = 1, judged: bool = True) -> PoseFi
     def fitted(rows: slice) -> PoseFits:
         return fit_poses(seen.at(rows), reject_outliers=judged, with_sensitivity=judged)
 
-    n, one = len(seen.t), vars(fitted(slice(0, 1)))
-    whole = {name: np.empty((n, *value.shape[1:]), value.dtype) for name, value in one.items()}
-
-    def fill(rows: slice) -> None:
-        for name, value in vars(fitted(rows)).items():
-            whole[name][rows] = value
-
     # NumPy releases the GIL for large arrays: parts of some hundred frames run in parallel
     with ThreadPoolExecutor(workers, thread_name_prefix="part") as pool:
-        list(pool.map(fill, parts(n)))
-    return PoseFits(**whole)
+        found = [vars(fits) for fits in pool.map(fitted, parts(max(len(seen.t), 1)))]
+    return PoseFits(**{name: np.concatenate([part[name] for part in found]) for name in found[0]})
 
 
 def _shared_sigma(fits: PoseFits, systematic: Array, rig: StereoRig, moved: Array) -> list[list[object]]:

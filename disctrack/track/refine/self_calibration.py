@@ -218,8 +218,7 @@ def sized_by_pattern(rig: StereoRig, size: float, sigma: float) -> tuple[StereoR
 
 def _from_middle(disc: Disc) -> Array:
     """(m, 2) [m] positions of the dots relative to their mean."""
-    d: Array = disc.marker_centres_body[:, :2] - disc.marker_centres_body[:, :2].mean(axis=0)
-    return d
+    return np.asarray(disc.marker_centres_body[:, :2] - disc.marker_centres_body[:, :2].mean(axis=0))
 
 
 def declared_places_kept(disc: Disc, shift: Array) -> Array:
