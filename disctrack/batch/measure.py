@@ -119,8 +119,12 @@ def _after_tracking(results: Path, path: Path, trajectory: Trajectory, job: Job)
             if wrong:
                 raise AnalysisError("a number is declared wrong, and a missing effect would be read into it")
             diagnosed = run_diagnose(path, overwrite=True).summary
-            row |= diagnosed_numbers(dict(diagnosed.data))
-            row["diagnosis_report"] = diagnosed.files[0].relative_to(results).as_posix()
+            row |= {
+                "diagnosis": diagnosed.data["verdict"],
+                "diagnosis_sentence": diagnosed.data["sentence"],
+                "diagnosis_p_value": diagnosed.data["chance"].get("p_value"),
+                "diagnosis_report": diagnosed.files[0].relative_to(results).as_posix(),
+            }
         except AnalysisError as error:
             missing.append(f"not diagnosed: {reason_of(error)}")
     return row | outcome(MEASURED, "; ".join(missing))
@@ -178,15 +182,6 @@ def friction_numbers(trajectory: Trajectory) -> Row:
         "k_m_sigma_m_s2": found.sigma("km.k_m") * np.sqrt(max(found.reduced_chi_square, 1.0)),
         "k_m_reduced_chi_square": found.reduced_chi_square,
         "k_m_undetermined": "",
-    }
-
-
-def diagnosed_numbers(document: Row) -> Row:
-    """Verdict of a diagnosis.json, and the probability of such a decrease of chi-square by chance."""
-    return {
-        "diagnosis": str(document.get("verdict", "")),
-        "diagnosis_sentence": str(document.get("sentence", "")),
-        "diagnosis_p_value": (document.get("chance") or {}).get("p_value"),
     }
 
 
