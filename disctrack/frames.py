@@ -91,9 +91,7 @@ def nodal_axes_world(psi: ArrayLike, theta: ArrayLike) -> tuple[Array, Array, Ar
 def euler_rate_axes_world(psi: ArrayLike, theta: ArrayLike) -> Array:
     """Matrix (..., 3, 3) with omega_world = matrix @ (psidot, thetadot, phidot); its columns are k, e1, e3."""
     e1, _, e3 = nodal_axes_world(psi, theta)
-    k = np.zeros_like(e1)
-    k[..., 2] = 1.0
-    return np.stack([k, e1, e3], axis=-1)
+    return np.stack(np.broadcast_arrays((0.0, 0.0, 1.0), e1, e3), axis=-1)
 
 
 def euler_jacobian(psi: ArrayLike, theta: ArrayLike) -> Array:
@@ -108,11 +106,7 @@ def euler_jacobian(psi: ArrayLike, theta: ArrayLike) -> Array:
 
 def skew(v: ArrayLike) -> Array:
     """Matrix of the cross product, skew(v) @ w = v x w; v (..., 3) -> (..., 3, 3)."""
-    v = np.asarray(v, float)
-    S = np.zeros((*v.shape[:-1], 3, 3))
-    S[..., 0, 1], S[..., 0, 2], S[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    S[..., 1, 0], S[..., 2, 0], S[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
-    return S
+    return np.cross(np.eye(3), np.asarray(v, float)[..., None, :])
 
 
 def quaternion_from_rotation(R: Array) -> Array:

@@ -76,9 +76,10 @@ class DotsInFrames:
         disc = replace(self.disc, marker_centres_body=self.disc.marker_centres_body + moved)
         return replace(self, rig=self.rig.perturbed(shift[:N_RIG]), disc=disc, pixels=pixels)
 
-    def fitted(self, shift: Array, reject: bool) -> tuple[DotsInFrames, PoseFits]:
-        """The frames with poses fitted after the shift; if a fit fails, the pose is kept."""
-        fits = fit_poses(self.shifted(shift), reject_outliers=reject, with_sensitivity=False)
+    def fitted(self, reject: bool, shift: Array | None = None) -> tuple[DotsInFrames, PoseFits]:
+        """The frames with poses fitted, after the shift if there is one; if a fit fails, the pose is kept."""
+        moved = self if shift is None else self.shifted(shift)
+        fits = fit_poses(moved, reject_outliers=reject, with_sensitivity=False)
         ok = fits.converged
         R = np.where(ok[:, None, None], fits.R_world_body, self.R)
         return replace(self, R=R, t=np.where(ok[:, None], fits.t_world_body, self.t)), fits

@@ -18,7 +18,7 @@ from disctrack.analyse.declaration import SIDE_TOLERANCE
 from disctrack.disc import Disc
 from disctrack.faults.dots import marker_pixels
 from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_vector
-from disctrack.track.pose import MIN_DOTS, DotsInFrames, fit_poses
+from disctrack.track.pose import MIN_DOTS, DotsInFrames
 
 MAX_BLOBS = 24
 EPIPOLAR_PX = 4.0  # centroids of blobs err by up to 1 px under glare, the rig by much less
@@ -241,10 +241,8 @@ def _best_explanation(
             if len(points):
                 gap = _gaps(R, t, points, camera, rig, disc)
                 matched[:, camera] = np.where((gap.min(axis=2) < 1)[..., None], points[gap.argmin(axis=2)], np.nan)
-        seen = DotsInFrames(rig, disc, matched, covariance, R, t)
-        fits = fit_poses(seen, reject_outliers=False, with_sensitivity=False)
-        R = np.where(fits.converged[:, None, None], fits.R_world_body, R)
-        t = np.where(fits.converged[:, None], fits.t_world_body, t)
+        seen, fits = DotsInFrames(rig, disc, matched, covariance, R, t).fitted(reject=False)
+        R, t = seen.R, seen.t
     explained = np.isfinite(matched).all(-1).sum((1, 2))
     rms = BLOB_PX * np.sqrt(fits.chi_square / np.maximum(explained, 1))
     # each dot explained is worth 2 px of rms; each half thickness off the table costs 0.5 px

@@ -56,7 +56,7 @@ def without_shared_faults(frames: DotsInFrames) -> AsBuilt | None:
     wide[:N_RIG] *= (np.diag(rig.covariance) > 0) & (np.arange(N_RIG) < PAIR_SHIFT.stop)
     shift, covariance, _, last = fit_shared(replace(frames.at(rows), further=by_delay[..., None]), wide)
     dots = slice(N_RIG, N_RIG + 2 * m)
-    _, fits = last.fitted(shift, reject=True)
+    _, fits = last.fitted(True, shift)
     spent = int(fits.degrees_of_freedom[fits.converged].sum())
     reduced = trimmed_reduced_chi_square(fits) * spent / max(spent - int(np.count_nonzero(wide)), 1)
     return AsBuilt.moved(rig, disc, shift[dots].reshape(m, 2), covariance[dots, dots], reduced)
