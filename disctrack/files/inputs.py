@@ -91,12 +91,6 @@ def refuse_input(path: Path) -> None:
 _ELSEWHERE = "Choose another place with -o."
 
 
-def _name(path: Path) -> str:
-    """Absolute path with links in its folders resolved; the last component may be a link."""
-    path = Path(os.path.abspath(path))
-    return os.path.normcase(os.path.join(os.path.realpath(path.parent), path.name))
-
-
 def _file(path: Path) -> tuple[int, int] | None:
     """Device and inode, equal for all names of a file; None if it does not exist."""
     try:
@@ -111,7 +105,9 @@ def _claimed(path: Path) -> str:
 
     The path is its recording.toml, matches a pattern in it, or is in the folder of its frames.
     """
-    place = Path(_name(path))
+    place = Path(os.path.abspath(path))
+    # with links in its folders resolved; the last component may be a link
+    place = Path(os.path.normcase(os.path.join(os.path.realpath(place.parent), place.name)))
     for folder in place.parents:
         file = folder / RECORDING_FILE
         for pattern in _patterns(file) if file.is_file() else ():

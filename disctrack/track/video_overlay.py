@@ -144,11 +144,9 @@ def _circle() -> Array:
 
 
 def _polylines(picture: ColourImage, lines: Sequence[Array] | Array, colour: str, closed: bool = True) -> None:
-    exact = np.asarray(lines)
-    finite: Mask = np.asarray(np.isfinite(exact).all(axis=2))  # not behind a camera, nor out of the lens's reach
-    whole = np.clip(np.rint(np.where(finite[..., None], 2**_SUBPIXEL_BITS * exact, 0.0)), -(2**24), 2**24).astype(
-        np.int32
-    )
+    fine = 2**_SUBPIXEL_BITS * np.asarray(lines)
+    finite: Mask = np.asarray(np.isfinite(fine).all(axis=2))  # not behind a camera, nor out of the lens's reach
+    whole = np.rint(np.clip(np.where(finite[..., None], fine, 0.0), -(2**24), 2**24)).astype(np.int32)
     fixed = [line[seen, None] for line, seen in zip(whole, finite, strict=True) if seen.sum() > 1]
     if fixed:
         cv2.polylines(picture, fixed, closed, _COLOURS[colour], 1, cv2.LINE_AA, _SUBPIXEL_BITS)
