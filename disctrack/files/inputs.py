@@ -46,10 +46,9 @@ def read_regular(path: Path, most: int) -> bytes:
 
 def why_not_regular(path: Path) -> str:
     """Why a path is not a regular file; "" if it is one, or does not exist."""
-    try:
+    with contextlib.suppress(OSError, ValueError):
         return _not_regular(path.stat())
-    except (OSError, ValueError):
-        return ""
+    return ""
 
 
 def _not_regular(status: os.stat_result) -> str:
@@ -93,11 +92,10 @@ _ELSEWHERE = "Choose another place with -o."
 
 def _file(path: Path) -> tuple[int, int] | None:
     """Device and inode, equal for all names of a file; None if it does not exist."""
-    try:
+    with contextlib.suppress(OSError, ValueError):
         status = path.stat()
-    except (OSError, ValueError):
-        return None
-    return status.st_dev, status.st_ino
+        return status.st_dev, status.st_ino
+    return None
 
 
 def _claimed(path: Path) -> str:

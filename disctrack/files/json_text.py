@@ -29,7 +29,7 @@ def json_text(document: Any, indent: int | None = None) -> str:
     return json.dumps(plain(document), indent=indent, allow_nan=False)
 
 
-def json_sha256(document: Any) -> str:
+def json_sha256(document: object) -> str:
     """SHA-256 (hex) of the document as strict JSON; the order of keys does not matter."""
     return sha256(json.dumps(plain(document), sort_keys=True).encode()).hexdigest()
 
