@@ -71,8 +71,7 @@ def unwrap_euler(euler: Array) -> Array:
     """
     result = np.array(euler, float)
     good = np.flatnonzero(np.isfinite(result).all(axis=-1))
-    psi, total = result[good, 0], result[good, 0] + result[good, 2]
-    psi, total = np.unwrap(psi), np.unwrap(total)
+    psi, total = np.unwrap(result[good, 0]), np.unwrap(result[good, 0] + result[good, 2])
     result[good, 0], result[good, 2] = psi, total - psi
     return result
 
