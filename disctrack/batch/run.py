@@ -7,7 +7,7 @@ import contextlib
 import csv
 import io
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -234,33 +234,29 @@ def write_summary(
     remedy = "Make it anew with --summary-only."
     with told_as(OutputError, said, Timeout, then=remedy), locked(found.common / ".summary.lock", wait):
         rows = with_false_discovery(rows_of(found, records))
-        return rows, tuple(_write(found, rows, options))
-
-
-def _write(found: FoundRecordings, rows: Sequence[Row], options: BatchOptions) -> Iterator[Path]:
-    folder, repeats = found.common, repeats_of(rows)
-    document = {
-        "schema": SCHEMA,
-        "schema_version": SCHEMA_VERSION,
-        "version": __version__,
-        "searched": [str(found.base), *found.problems],
-        "options": asdict(options),
-        "counts": counts(rows),
-        "columns": COLUMNS,
-        "recordings": rows,
-        "columns_of_repeats": REPEATS,
-        "repeats": repeats,
-    }
-    together = TOGETHER if (folder / TOGETHER).is_file() else ""
-    contents = {
-        "summary.json": json_file(document),
-        "summary.csv": as_csv(COLUMNS, rows),
-        "repeats.csv": as_csv(REPEATS, repeats),
-        "index.html": page(report_of(rows, repeats, together=together)).encode(),
-    }
-    for name, content in contents.items():
-        write_whole(folder / name, content)
-        yield folder / name
+        repeats = repeats_of(rows)
+        document = {
+            "schema": SCHEMA,
+            "schema_version": SCHEMA_VERSION,
+            "version": __version__,
+            "searched": [str(found.base), *found.problems],
+            "options": asdict(options),
+            "counts": counts(rows),
+            "columns": COLUMNS,
+            "recordings": rows,
+            "columns_of_repeats": REPEATS,
+            "repeats": repeats,
+        }
+        together = TOGETHER if (found.common / TOGETHER).is_file() else ""
+        files = {
+            found.common / "summary.json": json_file(document),
+            found.common / "summary.csv": as_csv(COLUMNS, rows),
+            found.common / "repeats.csv": as_csv(REPEATS, repeats),
+            found.common / "index.html": page(report_of(rows, repeats, together=together)).encode(),
+        }
+        for file, content in files.items():
+            write_whole(file, content)
+        return rows, tuple(files)
 
 
 def with_false_discovery(rows: Sequence[Row]) -> list[Row]:
