@@ -5,7 +5,7 @@ candidate poses. If one camera sees too few dots, three blobs of the other give 
 problem). Of mirror-image solutions the one that touches the table is chosen.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations, permutations
 
 import cv2
@@ -42,16 +42,13 @@ def dot_blobs(image: AnyArray, expected_diameter_px: float) -> Array:
     spread = np.median(np.abs(smooth - mean))
     # relative to the local mean, against gradients of glare; three spreads at least, for dim images
     threshold = np.maximum(0.12 * mean, 3.0 * spread)
-    found = []
-    for mask in (smooth < mean - threshold, smooth > mean + threshold):
-        found += _elliptical_components(mask.astype(np.uint8), expected_diameter_px)
-    found.sort()
+    masks = smooth < mean - threshold, smooth > mean + threshold
+    found = sorted(blob for mask in masks for blob in _elliptical_components(mask, expected_diameter_px))
     return np.array([blob[1:] for blob in found[:MAX_BLOBS]], float).reshape(-1, 3)
 
 
-def _elliptical_components(mask: AnyArray, diameter: float) -> list[tuple[float, float, float, float]]:
-    contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    result = []
+def _elliptical_components(mask: AnyArray, diameter: float) -> Iterator[tuple[float, float, float, float]]:
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     for contour in contours:
         if len(contour) < 8:
             continue
@@ -66,8 +63,7 @@ def _elliptical_components(mask: AnyArray, diameter: float) -> list[tuple[float,
             continue
         misfit = abs(area / (4 * np.pi * np.sqrt(major * minor)) - 1.0)
         if misfit < 0.08 and 2 * np.sqrt(major) < 1.3 * diameter:
-            result.append((misfit, moments["m10"] / area, moments["m01"] / area, area))
-    return result
+            yield misfit, moments["m10"] / area, moments["m01"] / area, area
 
 
 def expected_diameter_px(rig: StereoRig, disc: Disc) -> list[float]:

@@ -86,11 +86,6 @@ class Tracker:
         Raises ArgumentError if they are no images, TrackingError if the rig was calibrated at another size.
         """
         self.frame += 1
-        images, rows = self._as_block(left, right), empty_tables(1, self.disc.n_markers)
-        follow_block(self._follower, images, np.ones((1, 2), bool), rows, 0)
-        return self._pose(rows)
-
-    def _as_block(self, left: Image, right: Image) -> AnyArray:
         left, right = grey_values(left, "left"), grey_values(right, "right")
         if left.dtype != right.dtype or left.shape != right.shape or left.ndim != 2:
             raise ArgumentError(
@@ -98,7 +93,10 @@ class Tracker:
                 "(height, width), both of one type"
             )
         check_images(left.shape[::-1], self.rig)
-        return np.stack([left, right])[None]
+        images: AnyArray = np.stack([left, right])[None]
+        rows = empty_tables(1, self.disc.n_markers)
+        follow_block(self._follower, images, np.ones((1, 2), bool), rows, 0)
+        return self._pose(rows)
 
     def _pose(self, rows: Tables) -> LivePose:
         """Pose of one pair from its row of the tables; without a pose the pair has no dots either."""
