@@ -76,12 +76,8 @@ _T = _f(0.3275911 / math.sqrt(2.0))
 _ERFC = tuple(_f(0.5 * a) for a in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429))
 # exp(-z^2 / 2) = e^16, e = exp(-z^2 / 32) a polynomial in z^2: 6e-8 for |z| < 6
 _Z2_MAX = _f(36.0)
-_EXP = tuple(
-    _f(c)
-    for c in np.polynomial.Chebyshev.interpolate(lambda z2: np.exp(-z2 / 32.0), 6, domain=[0.0, 36.0])
-    .convert(kind=np.polynomial.Polynomial)
-    .coef
-)
+_SERIES = np.polynomial.Chebyshev.interpolate(lambda z2: np.exp(-z2 / 32.0), 6, domain=[0.0, 36.0])
+_EXP = tuple(map(_f, _SERIES.convert(kind=np.polynomial.Polynomial).coef))
 
 
 @_part
