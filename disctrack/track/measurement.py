@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import FrameRate, Gravity, Threads, Times, checked, grey_values
-from calibration.kit.arrays import AnyArray, Array
+from calibration.kit.arrays import AnyArray
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.declaration import Boards, contradictions, with_square
 from disctrack.disc import Disc
@@ -147,7 +147,8 @@ def measure(
     began = time.perf_counter()
     span = _span(pairs, recording.frame_rate, settings)
     progress(len(pairs) - (span.stop - span.start))
-    found = _tracked(recording, rig, pairs, settings, span, stamps, threads or default_threads(), progress)
+    taken = Taken(range(span.start, span.stop), recording.frame_rate, recording.gravity, stamps)
+    found = _tracked(recording, rig, pairs, settings, taken, threads or default_threads(), progress)
     seconds = time.perf_counter() - began
     findings = (
         *pairs.findings,
@@ -165,9 +166,8 @@ def measure(
     trajectory = at_full_length(found.trajectory, len(pairs.left), span.start, stamps)
     for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
         trajectory.frame_status[still] = FrameStatus.STILL
-    trajectory = replace(trajectory, air_density=recording.air_density)
     findings = contradictions(trajectory, recording.disc, recording, findings, boards, details["blur_px"])
-    trajectory = replace(trajectory, findings=findings)
+    trajectory = replace(trajectory, air_density=recording.air_density, findings=findings)
     warn_of_doubts(findings)
     return Measurement(trajectory, details, found.unreadable, seconds)
 
@@ -246,24 +246,20 @@ def _tracked(
     rig: StereoRig,
     pairs: ImagePairs,
     settings: TrackingSettings,
-    span: MotionSpan,
-    stamps: Array | None,
+    taken: Taken,
     threads: int,
     progress: Progress,
 ) -> Measurement:
-    """Track the disc through the span; stamps : times of all frames [s]."""
+    """Track the disc through the pairs taken."""
     not_read: NotRead = {}  # a dictionary, as some images are read twice
-    tracked = range(span.start, span.stop)
     workers = 1  # stretches followed in parallel: one per core, if frames can be read in any order
     if pairs.left.random_access and pairs.right.random_access:
-        workers = max(1, min(threads, len(stretch_edges(tracked, recording.disc)) - 1))
+        workers = max(1, min(threads, len(stretch_edges(taken.pairs, recording.disc)) - 1))
     reading = pairs.reading(not_read, max(1, threads // workers))  # each worker has its own three blocks
-    stamps = None if stamps is None else stamps[span.start : span.stop]
-    taken = Taken(tracked, recording.frame_rate, recording.gravity, stamps)
     try:
         found = track(reading, taken, rig, recording.disc, settings, workers, progress)
     except TrackingError as error:
-        refuse_unreadable(recording, not_read, 2 * len(tracked), error)
+        refuse_unreadable(recording, not_read, 2 * len(taken.pairs), error)
         error.findings = with_square(error.findings, recording)
         raise
     return replace(found, unreadable=dict(sorted(not_read.items())))

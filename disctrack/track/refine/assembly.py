@@ -62,12 +62,13 @@ class Taken:
     pairs: range
     frame_rate: float  # [Hz]
     gravity: float = 9.81  # [m/s^2]
-    stamps: Array | None = None  # (n,) [s] written by the camera
+    stamps: Array | None = None  # [s] of all frames, written by the camera
 
     @property
     def time(self) -> Array:
         """(n,) [s]."""
-        return np.array(self.pairs) / self.frame_rate if self.stamps is None else np.asarray(self.stamps, float)
+        frames = np.array(self.pairs)
+        return frames / self.frame_rate if self.stamps is None else np.asarray(self.stamps[frames], float)
 
 
 def assemble(

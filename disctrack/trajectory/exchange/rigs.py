@@ -71,7 +71,8 @@ def array_of(table: Table, key: str, shape: tuple[int, ...], where: str) -> Arra
 
 def rotation_of(rotation: Array, where: str) -> Array:
     """(3, 3) from a matrix or a rotation vector. Raises RigFileError, whose message begins with `where`."""
-    R = rotation_from_vector(rotation.reshape(3)) if rotation.size == 3 else rotation
+    with np.errstate(all="ignore"):  # numbers in a file could overflow; they give no rotation
+        R = rotation_from_vector(rotation.reshape(3)) if rotation.size == 3 else rotation
     whole = R.size == 9 and np.abs(R).max() < 2  # larger numbers in a file could overflow
     R = R.reshape(3, 3) if whole else np.zeros((3, 3))
     if not np.abs(R @ R.T - np.eye(3)).max() < 1e-6 or np.linalg.det(R) < 0:
