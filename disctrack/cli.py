@@ -162,7 +162,3 @@ def _parser() -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParse
         with suppress(ImportError):
             importlib.import_module("argcomplete").autocomplete(parser)
     return parser, commands
-
-
-if __name__ == "__main__":
-    sys.exit(main())

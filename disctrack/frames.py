@@ -37,29 +37,16 @@ COORDINATES = ("x", "y", "z", "psi", "theta", "phi")
 CAMERAS = ("left", "right")
 
 
-def rotation_x(angle: ArrayLike) -> Array:
-    """Rotation about the first axis; angle (...) [rad] -> (..., 3, 3)."""
-    return _axis_rotation(angle, 1, 2)
+def rotation_from_euler(psi: ArrayLike, theta: ArrayLike, phi: ArrayLike) -> Array:
+    """R_world_body = Rz(psi) Rx(theta) Rz(phi); angles (...) [rad], wrapped or not -> (..., 3, 3)."""
+    e1, e2, e3 = nodal_axes_world(psi, theta)
+    s, c = np.sin(phi)[..., None], np.cos(phi)[..., None]
+    return np.stack(np.broadcast_arrays(c * e1 + s * e2, c * e2 - s * e1, e3), axis=-1)
 
 
 def rotation_z(angle: ArrayLike) -> Array:
     """Rotation about the third axis; angle (...) [rad] -> (..., 3, 3)."""
-    return _axis_rotation(angle, 0, 1)
-
-
-def _axis_rotation(angle: ArrayLike, i: int, j: int) -> Array:
-    angle = np.asarray(angle, float)
-    R = np.zeros((*angle.shape, 3, 3))
-    R[..., 0, 0] = R[..., 1, 1] = R[..., 2, 2] = 1.0
-    R[..., i, i] = R[..., j, j] = np.cos(angle)
-    R[..., j, i] = np.sin(angle)
-    R[..., i, j] = -R[..., j, i]
-    return R
-
-
-def rotation_from_euler(psi: ArrayLike, theta: ArrayLike, phi: ArrayLike) -> Array:
-    """R_world_body = Rz(psi) Rx(theta) Rz(phi); angles (...) [rad], wrapped or not -> (..., 3, 3)."""
-    return rotation_z(psi) @ rotation_x(theta) @ rotation_z(phi)
+    return rotation_from_euler(0.0, 0.0, angle)
 
 
 def euler_from_rotation(R_world_body: Array) -> Array:
@@ -84,8 +71,7 @@ def unwrap_euler(euler: Array) -> Array:
     """
     result = np.array(euler, float)
     good = np.flatnonzero(np.isfinite(result).all(axis=-1))
-    psi, total = result[good, 0], result[good, 0] + result[good, 2]
-    psi, total = np.unwrap(psi), np.unwrap(total)
+    psi, total = np.unwrap(result[good, 0]), np.unwrap(result[good, 0] + result[good, 2])
     result[good, 0], result[good, 2] = psi, total - psi
     return result
 
@@ -104,9 +90,7 @@ def nodal_axes_world(psi: ArrayLike, theta: ArrayLike) -> tuple[Array, Array, Ar
 def euler_rate_axes_world(psi: ArrayLike, theta: ArrayLike) -> Array:
     """Matrix (..., 3, 3) with omega_world = matrix @ (psidot, thetadot, phidot); its columns are k, e1, e3."""
     e1, _, e3 = nodal_axes_world(psi, theta)
-    k = np.zeros_like(e1)
-    k[..., 2] = 1.0
-    return np.stack([k, e1, e3], axis=-1)
+    return np.stack(np.broadcast_arrays((0.0, 0.0, 1.0), e1, e3), axis=-1)
 
 
 def euler_jacobian(psi: ArrayLike, theta: ArrayLike) -> Array:
@@ -121,11 +105,7 @@ def euler_jacobian(psi: ArrayLike, theta: ArrayLike) -> Array:
 
 def skew(v: ArrayLike) -> Array:
     """Matrix of the cross product, skew(v) @ w = v x w; v (..., 3) -> (..., 3, 3)."""
-    v = np.asarray(v, float)
-    S = np.zeros((*v.shape[:-1], 3, 3))
-    S[..., 0, 1], S[..., 0, 2], S[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    S[..., 1, 0], S[..., 2, 0], S[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
-    return S
+    return np.cross(np.eye(3), np.asarray(v, float)[..., None, :])
 
 
 def quaternion_from_rotation(R: Array) -> Array:

@@ -1,7 +1,5 @@
 """How child processes are started."""
 
-from __future__ import annotations
-
 import contextlib
 import multiprocessing
 import os

@@ -7,10 +7,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Indices
 from calibration.kit.errors import CalibrationError
 
 LEAST_POINTS = 8  # of a view: fewer do not determine its pose
@@ -40,7 +39,7 @@ class Board:
         return _grid(self.inner_corners) * self.square
 
     @property
-    def orders(self) -> list[NDArray[np.intp]]:
+    def orders(self) -> list[Indices]:
         """Symmetries (rotations in its plane) as orders of its points; the first is the identity."""
         columns, rows = self.inner_corners
         orders = board_orders(self.inner_corners)
@@ -52,7 +51,7 @@ class Board:
         return f"a board of {self.inner_corners[0]} x {self.inner_corners[1]} inner corners"
 
 
-def board_orders(inner_corners: tuple[int, int]) -> list[NDArray[np.intp]]:
+def board_orders(inner_corners: tuple[int, int]) -> list[Indices]:
     """Symmetries of a chessboard (rotations in its plane) as orders of its corners: 2, or 4 for a square board."""
     columns, rows = inner_corners
     index = np.arange(columns * rows).reshape(rows, columns)
@@ -90,7 +89,7 @@ class CharucoBoard:
         return (_grid(self.inner_corners) * [1, -1, 1] + [0, self.inner_corners[1] - 1, 0]) * self.square
 
     @property
-    def orders(self) -> list[NDArray[np.intp]]:
+    def orders(self) -> list[Indices]:
         """The identity alone: its markers determine the orientation."""
         return [np.arange(len(self.points))]
 

@@ -9,13 +9,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.fit.board_motion import BoardMotion, motions
 from calibration.fit.priors import Prior
 from calibration.fit.stereo_model import N_STEREO, Observations, StereoModel, moved, predict
 from calibration.kit import least_squares
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array, Indices, Mask
 from calibration.kit.errors import CalibrationError
 from calibration.kit.least_squares import Minimum, Normal, normal_of_rows
 
@@ -42,7 +41,7 @@ class Problem:
         return 6 if self.motion is None and not self.apart.any() else 12
 
     @property
-    def places(self) -> NDArray[np.intp]:
+    def places(self) -> Indices:
         """(m,) place of the board at each observation: twice its view, or one more for its second place."""
         o = self.observations
         return 2 * o.view + o.camera * self.apart[o.view]
@@ -51,7 +50,7 @@ class Problem:
         """The same with other observations, and `extra` [px^2] added to their covariances in both axes."""
         return replace(self, observations=observations, weights=inverse_covariance(observations.covariance, extra))
 
-    def rows(self, model: StereoModel, beyond: Array | None = None) -> tuple[Array, NDArray[np.intp]]:
+    def rows(self, model: StereoModel, beyond: Array | None = None) -> tuple[Array, Indices]:
         """Whitened rows (r, c) of all data, and the view of each (r,).
 
         Columns: pose of the board, or both if some views have two | stereo | shape | beyond (m, 2, b) | residual.

@@ -13,12 +13,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.board.chessboard import BoardNotFound, CornerView
 from calibration.cameras.camera import CAMERA_NAMES, Camera, by_turning, project_with_jacobians, vector_from_rotation
 from calibration.fit.stereo_model import Observations, StereoModel
-from calibration.kit.arrays import Array, Mask, evenly
+from calibration.kit.arrays import AnyArray, Array, Indices, Mask, evenly
 from calibration.kit.errors import CalibrationError
 
 FLOOR = 1e-3  # of the image's longer side: accuracy of poses by rough cameras; views that differ by less are identical
@@ -43,15 +42,15 @@ Views = tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]
 class BoardPoses:
     """Poses of the board in n images of one camera, from that camera alone."""
 
-    views: NDArray[np.intp]  # (n,) ascending numbers of the images
+    views: Indices  # (n,) ascending numbers of the images
     R: Array  # (n, 3, 3) board to camera
     middle: Array  # (n, 3) [m] of the board
     covariance: Array  # (n, 6, 6) of rotation and shift of the middle, for 1 px of noise, times the number of points
 
-    def __getitem__(self, index: NDArray) -> BoardPoses:
+    def __getitem__(self, index: AnyArray) -> BoardPoses:
         return BoardPoses(self.views[index], self.R[index], self.middle[index], self.covariance[index])
 
-    def of(self, views: NDArray) -> BoardPoses:
+    def of(self, views: AnyArray) -> BoardPoses:
         """Those of images with these numbers."""
         return self[np.searchsorted(self.views, views)]
 
@@ -141,7 +140,7 @@ class Pairs:
     """Which views are pairs: their two images, each with its own pose of the board, agree with the other pairs."""
 
     model: StereoModel  # with a pose of the board for each image alone
-    views: NDArray[np.intp]  # with such poses in both images
+    views: Indices  # with such poses in both images
     odd: dict[int, str] = field(default_factory=dict)  # view -> why its two images are no pair
     bad_images: dict[tuple[int, int], str] = field(default_factory=dict)  # (view, camera) -> why it is not used at all
     # If a camera was moved between views: the stretches of pairs before and after each step; and for each step its
@@ -177,7 +176,7 @@ class Pairing:
 
     R_right_left: Array  # (3, 3)
     t_right_left: Array  # (3,) [m]
-    order: NDArray[np.intp]  # (n,) index of the board's symmetry in the right image of each pair
+    order: Indices  # (n,) index of the board's symmetry in the right image of each pair
     distance: Array  # (n,) [px]
     evidence: float  # mean log likelihood of the pairs
     floor: float  # [px]
@@ -234,7 +233,7 @@ def paired(
     as_seen = [right.turned(turn) for turn in board_turns(n_orders)]
     mirrored = [right.turned(turn @ np.diag([-1.0, 1.0, 1.0]), True) for turn in board_turns(4 if is_square else 2)]
 
-    def pairs_of(right_of: NDArray, among: NDArray = left.views, turns: Sequence[BoardPoses] = as_seen) -> Paired:
+    def pairs_of(right_of: AnyArray, among: AnyArray = left.views, turns: Sequence[BoardPoses] = as_seen) -> Paired:
         both = among[np.isin(right_of[among], right.views)]
         return left.of(both), [one.of(right_of[both]) for one in turns]
 
@@ -297,7 +296,7 @@ def _require_agreement(stored: Pairing, others: Sequence[float]) -> None:
 
 
 def _late(
-    pairs_of: Callable[[NDArray, NDArray], Paired], odd: NDArray[np.intp], found: Pairing, names: Names
+    pairs_of: Callable[[AnyArray, AnyArray], Paired], odd: Indices, found: Pairing, names: Names
 ) -> tuple[str, ...]:
     """Warnings about pairs among the `odd` that would agree with a later or an earlier right view."""
     rest, notes = odd, []

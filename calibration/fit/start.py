@@ -7,13 +7,12 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.board.target import LEAST_POINTS, Target
 from calibration.cameras.camera import CAMERA_NAMES, Camera, StereoRig, rotation_from_vector
 from calibration.fit.pairing import FLOOR, GOOD_VIEWS, MOST_TRIED, Names, Pairs, board_turns, paired, poses_of
 from calibration.fit.stereo_model import Observations, StereoModel
-from calibration.kit.arrays import Array, Array32, evenly
+from calibration.kit.arrays import Array, Array32, Indices, evenly
 from calibration.kit.errors import CalibrationError
 
 MOST_K1 = 10.0  # larger than in any real lens: above, the views do not determine it
@@ -71,7 +70,7 @@ def start_camera(
 
 def start_stereo(
     observations: Observations, target: Target, image_sizes: Sequence[tuple[int, int]], names: Names
-) -> tuple[Pairs, dict[int, NDArray[np.intp]], tuple[str, ...]]:
+) -> tuple[Pairs, dict[int, Indices], tuple[str, ...]]:
     """Rough cameras, their relative pose, and which images are pairs.
 
     image_sizes : of the left and of the right camera; names : (left, right) of all views

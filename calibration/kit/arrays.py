@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+AnyArray = NDArray  # of another type: grey values, records, variables of a file
+Indices = NDArray[np.intp]
+Codes = NDArray[np.uint8]  # members of an IntEnum
 Numbers = NDArray[np.inexact[Any]]  # real, or complex if imaginary parts carry derivatives
 Array32 = NDArray[np.float32]
 Image = NDArray[np.uint8] | NDArray[np.uint16]  # one image or a stack, as a camera records it

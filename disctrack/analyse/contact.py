@@ -87,8 +87,7 @@ def rolling_onset(found: Propagated, until: float = np.inf) -> RollingOnset:
         verdict = f"rolls without slip from the first frame on (95 %: at the latest from {high:.4f} s)"
     else:
         verdict = f"rolls without slip from {median:.4f} s on (95 %: {low:.4f} to {high:.4f} s)"
-    times_found = float(median), float(low), float(high)
-    return RollingOnset(*times_found, probability, distance, distance_sigma, late, verdict)
+    return RollingOnset(float(median), float(low), float(high), probability, distance, distance_sigma, late, verdict)
 
 
 def _log_normal(v: Array, C: Array, extra: float) -> Array:

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array, Indices, Mask
 from calibration.kit.brief import Brief
 from disctrack.analyse.smoothing import HALF_WINDOW_LENGTHS, SEGMENT, fit_process, moving_weights
 from disctrack.disc import Disc
@@ -105,7 +104,7 @@ class MeasuredMotion(MotionState):
         """(n,) True if the motion is determined."""
         return np.asarray(np.isfinite(self.omega_world).all(axis=1))
 
-    def systematic_at(self, frames: NDArray[np.int64]) -> Array:
+    def systematic_at(self, frames: Indices) -> Array:
         """(f, 18, 18) covariance of STATE by systematic errors, stationary with a squared-exponential covariance.
 
         With their pace w: S of the pose, w^2 S of its rate, 3 w^4 S of its second derivative, -w^2 S between both.
@@ -282,9 +281,7 @@ def _sine_vectors(R: Array, R_reference: Array) -> tuple[Array, Array]:
     return s, gain
 
 
-def _smoothed(
-    samples: _Samples, length: Array, amplitude2: Array, rows: NDArray[np.int64]
-) -> tuple[Array, Array, Array, Array]:
+def _smoothed(samples: _Samples, length: Array, amplitude2: Array, rows: Indices) -> tuple[Array, Array, Array, Array]:
     """Some frames: state (k, 3 orders, 6), R (k, 3, 3), covariance (k, 18, 18), sensitivity (k, 18, 30), per interval.
 
     From weights (k, 6, 3, w) of the samples in their windows; the remaining prior covariance (k, 6, 3, 3) is added. NaN

@@ -12,9 +12,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array, evenly
+from calibration.kit.arrays import AnyArray, Array, Indices, evenly
 from disctrack.analyse.analysis import Analysis
 from disctrack.files.json_text import plain
 from disctrack.findings import carried
@@ -23,7 +22,7 @@ from disctrack.report.html import page
 from disctrack.report.palette import RED
 from disctrack.trajectory import FrameStatus, Trajectory
 
-Drawn = Callable[[int], NDArray]  # frame -> both images with the fit on them, (height, 2 width, 3) BGR
+Drawn = Callable[[int], AnyArray]  # frame -> both images with the fit on them, (height, 2 width, 3) BGR
 
 MOST_ROWS = 1500  # frames on the page: every second, third, ... of longer recordings
 MOST_PICTURES = 80
@@ -121,7 +120,7 @@ def _plain(values: Array, digits: int) -> object:
     return plain(np.round(np.asarray(values, float), digits))
 
 
-def _pictures(rows: NDArray[np.intp], drawn: Drawn) -> Iterator[dict[str, Any]]:
+def _pictures(rows: Indices, drawn: Drawn) -> Iterator[dict[str, Any]]:
     for k in evenly(len(rows), MOST_PICTURES):
         picture = drawn(int(rows[k]))
         scale = min(1.0, 300 / picture.shape[0])

@@ -13,12 +13,11 @@ from typing import Annotated
 
 import numpy as np
 from numpy.polynomial import Polynomial
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.signal import find_peaks
 from scipy.special import stdtrit
 
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Indices
 from calibration.kit.brief import Brief
 from disctrack.analyse.derivatives import MIN_FRAMES
 from disctrack.disc import Disc, nutation_frequency, precession_rate
@@ -169,7 +168,7 @@ class _Fit:
         return self.ratio * self.psi
 
     @property
-    def period(self) -> NDArray[np.int64]:
+    def period(self) -> Indices:
         """Number of the nutation period (n,)."""
         return np.floor((self.phase - self.phase[0]) / (2 * np.pi)).astype(int)
 
@@ -273,7 +272,7 @@ def _linear_with_sigma(fit: _Fit) -> tuple[Array, Array, float]:
     return linear, sigma[: 2 * p].reshape(2, p), float(sigma[2 * p])
 
 
-def _clustered(J: Array, residual: Array, cluster: NDArray[np.int64]) -> Array:
+def _clustered(J: Array, residual: Array, cluster: Indices) -> Array:
     """Covariance of the parameters from residuals that are correlated within clusters; J (k, n, p), residual (k, n).
 
     Linearised jackknife over the clusters: without cluster g the parameters change by

@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Indices
 from calibration.kit.brief import Brief
 from disctrack.analyse.derivatives import K, MeasuredMotion, MotionState
 from disctrack.disc import Disc, precession_rate
@@ -131,7 +130,7 @@ class Propagated:
     jacobian: Array  # (n, k, 18) d value / d STATE
     motion: MeasuredMotion
 
-    def covariance(self, frames: NDArray[np.int64], columns: slice = slice(None), shared: bool = False) -> Array:
+    def covariance(self, frames: Indices, columns: slice = slice(None), shared: bool = False) -> Array:
         """(f, c, c) of some values in some frames by noise, or, if `shared`, by the rig and other systematic errors."""
         motion, J = self.motion, self.jacobian[frames][:, columns]
         if not shared:

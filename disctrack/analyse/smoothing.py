@@ -14,9 +14,8 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Indices
 
 LENGTHS = 2.0 * 1.15 ** np.arange(20)  # l in frame intervals: 2 (content up to the Nyquist rate) to 28
 RATIOS = 10.0 ** np.arange(0.0, 10.1, 0.5)  # (A / sigma)^2
@@ -143,7 +142,7 @@ def moving_weights(
     length: Array,
     amplitude2: Array,
     half_window: int,
-    points: NDArray[np.int64],
+    points: Indices,
 ) -> tuple[Array, Array]:
     """Weights (k, 3, 2 half_window + 1) and remaining prior covariance (k, 3, 3) for some samples.
 

@@ -4,8 +4,6 @@ The numbers of its row are in SI units and have sigmas; unknown numbers are NaN,
 """
 
 import contextlib
-import hashlib
-import json
 import time
 from pathlib import Path
 
@@ -27,7 +25,7 @@ from disctrack.diagnosis.model_file import declared_model
 from disctrack.diagnosis.recorded import wrong_declarations
 from disctrack.discrepancy.fit import fit
 from disctrack.errors import AnalysisError, DiscTrackError, TrackingError, reason_of
-from disctrack.files.json_text import plain
+from disctrack.files.json_text import json_sha256, plain
 from disctrack.findings import Kind, leading
 from disctrack.frames import CAMERAS, COORDINATES
 from disctrack.recording.declaration import read_recording
@@ -88,7 +86,7 @@ def make_recording(job: Job, results: Path) -> Row:
         "name": recording.name,
         "repeats": group_of(recording),
         "rig": job.rig,
-        "input_sha256": hashlib.sha256(json.dumps(dict(provenance.inputs), sort_keys=True).encode()).hexdigest(),
+        "input_sha256": json_sha256(dict(provenance.inputs)),
         "fingerprint": provenance.fingerprint,
         "version": provenance.version,
         "seconds": round(time.perf_counter() - began, 3),
@@ -121,8 +119,12 @@ def _after_tracking(results: Path, path: Path, trajectory: Trajectory, job: Job)
             if wrong:
                 raise AnalysisError("a number is declared wrong, and a missing effect would be read into it")
             diagnosed = run_diagnose(path, overwrite=True).summary
-            row |= diagnosed_numbers(dict(diagnosed.data))
-            row["diagnosis_report"] = diagnosed.files[0].relative_to(results).as_posix()
+            row |= {
+                "diagnosis": diagnosed.data["verdict"],
+                "diagnosis_sentence": diagnosed.data["sentence"],
+                "diagnosis_p_value": diagnosed.data["chance"].get("p_value"),
+                "diagnosis_report": diagnosed.files[0].relative_to(results).as_posix(),
+            }
         except AnalysisError as error:
             missing.append(f"not diagnosed: {reason_of(error)}")
     return row | outcome(MEASURED, "; ".join(missing))
@@ -180,15 +182,6 @@ def friction_numbers(trajectory: Trajectory) -> Row:
         "k_m_sigma_m_s2": found.sigma("km.k_m") * np.sqrt(max(found.reduced_chi_square, 1.0)),
         "k_m_reduced_chi_square": found.reduced_chi_square,
         "k_m_undetermined": "",
-    }
-
-
-def diagnosed_numbers(document: Row) -> Row:
-    """Verdict of a diagnosis.json, and the probability of such a decrease of chi-square by chance."""
-    return {
-        "diagnosis": str(document.get("verdict", "")),
-        "diagnosis_sentence": str(document.get("sentence", "")),
-        "diagnosis_p_value": (document.get("chance") or {}).get("p_value"),
     }
 
 

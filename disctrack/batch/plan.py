@@ -134,7 +134,13 @@ def make_plan(
             recording = read_recording(folder)
             about = Kind.READING
             undeclared = tuple(place for place in undeclared if not _has_views_of(place, recording))
-            jobs.append(_job(found, recording, name, options, rigs))
+            open_pairs(recording)  # raises if there is nothing to measure
+            rig = recording.rig_file
+            if rig is None:
+                # the folder's name is the hash of all inputs of the calibration
+                rig = found.common / "rigs" / source_of(recording).provenance.fingerprint[:16] / "rig.h5"
+                rigs.setdefault(str(rig), Job("rig", name, str(folder), str(rig.parent), str(rig), options))
+            jobs.append(Job("recording", name, str(folder), str(found.results(folder)), str(rig), options))
         except Exception as error:  # an error of one recording must not stop the others
             failures[name] = failed(reason_of(error), about)
     needed = {job.rig for job in jobs}
@@ -144,16 +150,3 @@ def make_plan(
 def _has_views_of(place: Path, recording: Recording) -> bool:
     """Are the calibration views, which recordings may share, in this folder?"""
     return recording.views is not None and (recording.folder / recording.views.left).resolve().is_relative_to(place)
-
-
-def _job(found: FoundRecordings, recording: Recording, name: str, options: BatchOptions, rigs: dict[str, Job]) -> Job:
-    folder = recording.folder
-    open_pairs(recording)  # raises if there is nothing to measure
-    results = found.results(folder)
-    rig = recording.rig_file
-    if rig is None:
-        # the folder's name is the hash of all inputs of the calibration
-        made_from = source_of(recording).provenance.fingerprint[:16]
-        rig = found.common / "rigs" / made_from / "rig.h5"
-        rigs.setdefault(str(rig), Job("rig", name, str(folder), str(rig.parent), str(rig), options))
-    return Job("recording", name, str(folder), str(results), str(rig), options)

@@ -19,7 +19,6 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPo
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from types import FrameType
 
 import cv2
 
@@ -187,7 +186,8 @@ def _why_it_ended(process: SpawnProcess, said: Path) -> str:
 
 def _work(jobs: Connection, said: Path) -> None:
     """Main loop of a new process: redirect printed output to a file, end with the parent, do jobs."""
-    signal.signal(signal.SIGTERM, _stop)
+    # an exit, so that `finally` blocks remove half-written files
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     output = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for stream in (1, 2):
         os.dup2(output, stream)
@@ -201,8 +201,3 @@ def _work(jobs: Connection, said: Path) -> None:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
             signal.raise_signal(signal.SIGTERM)
         jobs.send(row)
-
-
-def _stop(number: int, frame: FrameType | None) -> None:
-    """Raise SystemExit, so that `finally` blocks remove half-written files."""
-    sys.exit(128 + number)

@@ -6,9 +6,8 @@ The summary has one row per recording, as JSON and as CSV, merged from all proce
 import contextlib
 import csv
 import io
-import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from disctrack.errors import AnalysisError, ArgumentError, ClusterError, OutputE
 from disctrack.files.json_text import json_file
 from disctrack.files.software import __version__
 from disctrack.files.text import csv_cell
-from disctrack.files.whole import check_writable, write_whole
+from disctrack.files.whole import check_writable, seen_from, write_whole
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.progress import progress_bar
 from disctrack.recording.declaration import FILE_NAME
@@ -117,7 +116,7 @@ def run_batch(
         records.setdefault(job.name, outcome(NOT_MEASURED, stopped))
     whole = shard is None  # only then the diagnosis of all together is made here
     done = _summed_up(found, mine, records, options, stopped == INTERRUPTED, n if whole else 0)
-    return replace(done, undeclared=tuple(os.path.relpath(place, found.base) for place in undeclared))
+    return replace(done, undeclared=tuple(str(seen_from(found.base, place)) for place in undeclared))
 
 
 def summarise_batch(
@@ -204,7 +203,7 @@ def rows_of(found: FoundRecordings, records: Mapping[str, Row]) -> list[Row]:
         row: Row = {column: known.get(column) for column in COLUMNS} | {"recording": name}
         paths = {what: results / row[what] for what in PATHS if row[what]} | {"folder": folder}
         paths |= {"rig": Path(row["rig"])} if row["rig"] else {}
-        rows.append(row | {what: _relative(path, found.common) for what, path in paths.items()})
+        rows.append(row | {what: seen_from(found.common, path).as_posix() for what, path in paths.items()})
     return rows
 
 
@@ -222,13 +221,6 @@ def _on_the_disk(folder: Path, results: Path) -> Row:
     return row | outcome(SKIPPED, "; ".join(filter(None, [stale, row["reason"]])))
 
 
-def _relative(path: Path, folder: Path) -> str:
-    try:
-        return Path(os.path.relpath(path, folder)).as_posix()
-    except ValueError:  # another drive
-        return path.as_posix()
-
-
 def write_summary(
     found: FoundRecordings, records: Mapping[str, Row], options: BatchOptions
 ) -> tuple[list[Row], tuple[Path, ...]]:
@@ -242,33 +234,29 @@ def write_summary(
     remedy = "Make it anew with --summary-only."
     with told_as(OutputError, said, Timeout, then=remedy), locked(found.common / ".summary.lock", wait):
         rows = with_false_discovery(rows_of(found, records))
-        return rows, tuple(_write(found, rows, options))
-
-
-def _write(found: FoundRecordings, rows: Sequence[Row], options: BatchOptions) -> Iterator[Path]:
-    folder, repeats = found.common, repeats_of(rows)
-    document = {
-        "schema": SCHEMA,
-        "schema_version": SCHEMA_VERSION,
-        "version": __version__,
-        "searched": [str(found.base), *found.problems],
-        "options": asdict(options),
-        "counts": counts(rows),
-        "columns": COLUMNS,
-        "recordings": rows,
-        "columns_of_repeats": REPEATS,
-        "repeats": repeats,
-    }
-    together = TOGETHER if (folder / TOGETHER).is_file() else ""
-    contents = {
-        "summary.json": json_file(document),
-        "summary.csv": as_csv(COLUMNS, rows),
-        "repeats.csv": as_csv(REPEATS, repeats),
-        "index.html": page(report_of(rows, repeats, together=together)).encode(),
-    }
-    for name, content in contents.items():
-        write_whole(folder / name, content)
-        yield folder / name
+        repeats = repeats_of(rows)
+        document = {
+            "schema": SCHEMA,
+            "schema_version": SCHEMA_VERSION,
+            "version": __version__,
+            "searched": [str(found.base), *found.problems],
+            "options": asdict(options),
+            "counts": counts(rows),
+            "columns": COLUMNS,
+            "recordings": rows,
+            "columns_of_repeats": REPEATS,
+            "repeats": repeats,
+        }
+        together = TOGETHER if (found.common / TOGETHER).is_file() else ""
+        files = {
+            found.common / "summary.json": json_file(document),
+            found.common / "summary.csv": as_csv(COLUMNS, rows),
+            found.common / "repeats.csv": as_csv(REPEATS, repeats),
+            found.common / "index.html": page(report_of(rows, repeats, together=together)).encode(),
+        }
+        for file, content in files.items():
+            write_whole(file, content)
+        return rows, tuple(files)
 
 
 def with_false_discovery(rows: Sequence[Row]) -> list[Row]:

@@ -145,7 +145,7 @@ def calibrate_into(
     summarised = {
         "verdict": f"{found.assessment.verdict}.",
         "accuracy": found.assessment.figures,
-        "rows": summary.calibration_rows(found, problems),
+        "rows": list(summary.calibration_rows(found, problems)),
         "doubts": found.doubts,
         "warnings": found.warnings,
     }

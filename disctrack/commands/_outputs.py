@@ -1,19 +1,18 @@
 """Common parts of the commands: options, checks, reports and output files."""
 
 import argparse
-import os
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from numpy.typing import NDArray
-
 from calibration import StereoRig
+from calibration.kit.arrays import AnyArray
 from disctrack.calibrate.stage import boards_in
 from disctrack.commands import DONE, INCOMPLETE
 from disctrack.files.json_text import json_text
 from disctrack.files.whole import check_writable as check_writable
+from disctrack.files.whole import seen_from
 from disctrack.findings import Kind, Severity, in_doubt, leading, of_kind
 from disctrack.progress import progress_bar
 from disctrack.recording.declaration import FILE_NAME, Recording
@@ -156,7 +155,7 @@ def _companions(
         yield video
 
 
-def pair_of(pairs: ImagePairs, row: int) -> NDArray:
+def pair_of(pairs: ImagePairs, row: int) -> AnyArray:
     """Both images of a frame (2, height, width); one that cannot be read is black."""
     (block,) = iter_pair_blocks(pairs.left, pairs.right, row, row + 1)
     return block.images[0]
@@ -164,8 +163,4 @@ def pair_of(pairs: ImagePairs, row: int) -> NDArray:
 
 def relative(path: Path) -> Path:
     """The shorter of the path and its form relative to the working folder."""
-    try:
-        short = Path(os.path.relpath(path))
-    except ValueError:  # another drive
-        return path
-    return min(short, path, key=lambda p: len(str(p)))
+    return min(seen_from(Path(), path), path, key=lambda p: len(str(p)))

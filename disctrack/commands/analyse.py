@@ -5,8 +5,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from numpy.typing import NDArray
-
+from calibration.kit.arrays import AnyArray
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.motion_page import motion_html
 from disctrack.analyse.stage import run_analyse
@@ -63,6 +62,6 @@ def _write_motion_page(page: Path, analysis: Analysis, trajectory: Path, recordi
     write_whole(page, motion_html(analysis, read_provenance(trajectory).recording, drawn).encode())
 
 
-def _drawn(trajectory: Trajectory, pairs: ImagePairs, row: int) -> NDArray:
+def _drawn(trajectory: Trajectory, pairs: ImagePairs, row: int) -> AnyArray:
     images = outputs.pair_of(pairs, row)
     return draw_pair(images, trajectory, row)[: images.shape[1]]  # without the strip of numbers

@@ -21,7 +21,10 @@ def run(arguments: argparse.Namespace) -> int:
         source = _source_of_patterns(arguments)
         path = arguments.output or Path("rig.h5")
     else:
-        _refuse_options_with_recording(arguments)
+        if given := [option for option in VIEWS + TABLE if _given(arguments, option) is not None]:
+            raise RecordingError(
+                f"{', '.join(given)}: a recording's own recording.toml says this. Change it there, or give no folder."
+            )
         source = source_of(read_recording(arguments.recording))
         path = arguments.output or arguments.recording / outputs.RESULTS / "rig.h5"
     outputs.check_writable(path.parent)
@@ -42,14 +45,6 @@ def _source_of_patterns(arguments: argparse.Namespace) -> CalibrationSource:
         (arguments.board_thickness_mm or 0.0) * 1e-3,
         BoardTolerances(),
     )
-
-
-def _refuse_options_with_recording(arguments: argparse.Namespace) -> None:
-    given = [option for option in VIEWS + TABLE if _given(arguments, option) is not None]
-    if given:
-        raise RecordingError(
-            f"{', '.join(given)}: a recording's own recording.toml says this. Change it there, or give no folder."
-        )
 
 
 def _given(arguments: argparse.Namespace, option: str) -> Any:

@@ -11,15 +11,11 @@ PAGES = ("index.html", "*_analysis/report.html", "*_diagnosis/diagnosis.html", "
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Open it and print its path."""
-    page = last_page(arguments.recording)
-    webbrowser.open(page.resolve().as_uri())
-    print(page)
-
-
-def last_page(folder: Path) -> Path:
-    """The newest page of a recording, of its results, or of a batch. Raises OutputError if there is none."""
+    """Open the newest page of a recording, of its results, or of a batch, and print its path."""
+    folder: Path = arguments.recording
     pages = [page for below in FOLDERS for name in PAGES for page in (folder / below).glob(name)]
     if not pages:
         raise OutputError(f"{folder}: no page of results; `disctrack analyse {folder}` writes one")
-    return max(pages, key=lambda page: page.stat().st_mtime)
+    page = max(pages, key=lambda page: page.stat().st_mtime)
+    webbrowser.open(page.resolve().as_uri())
+    print(page)

@@ -46,10 +46,9 @@ def read_regular(path: Path, most: int) -> bytes:
 
 def why_not_regular(path: Path) -> str:
     """Why a path is not a regular file; "" if it is one, or does not exist."""
-    try:
+    with contextlib.suppress(OSError, ValueError):
         return _not_regular(path.stat())
-    except (OSError, ValueError):
-        return ""
+    return ""
 
 
 def _not_regular(status: os.stat_result) -> str:
@@ -91,19 +90,12 @@ def refuse_input(path: Path) -> None:
 _ELSEWHERE = "Choose another place with -o."
 
 
-def _name(path: Path) -> str:
-    """Absolute path with links in its folders resolved; the last component may be a link."""
-    path = Path(os.path.abspath(path))
-    return os.path.normcase(os.path.join(os.path.realpath(path.parent), path.name))
-
-
 def _file(path: Path) -> tuple[int, int] | None:
     """Device and inode, equal for all names of a file; None if it does not exist."""
-    try:
+    with contextlib.suppress(OSError, ValueError):
         status = path.stat()
-    except (OSError, ValueError):
-        return None
-    return status.st_dev, status.st_ino
+        return status.st_dev, status.st_ino
+    return None
 
 
 def _claimed(path: Path) -> str:
@@ -111,7 +103,9 @@ def _claimed(path: Path) -> str:
 
     The path is its recording.toml, matches a pattern in it, or is in the folder of its frames.
     """
-    place = Path(_name(path))
+    place = Path(os.path.abspath(path))
+    # with links in its folders resolved; the last component may be a link
+    place = Path(os.path.normcase(os.path.join(os.path.realpath(place.parent), place.name)))
     for folder in place.parents:
         file = folder / RECORDING_FILE
         for pattern in _patterns(file) if file.is_file() else ():

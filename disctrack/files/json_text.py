@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import is_dataclass
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,11 @@ def plain(item: Any) -> Any:
 def json_text(document: Any, indent: int | None = None) -> str:
     """The document as strict JSON."""
     return json.dumps(plain(document), indent=indent, allow_nan=False)
+
+
+def json_sha256(document: object) -> str:
+    """SHA-256 (hex) of the document as strict JSON; the order of keys does not matter."""
+    return sha256(json.dumps(plain(document), sort_keys=True).encode()).hexdigest()
 
 
 def json_file(document: Any) -> bytes:

@@ -79,10 +79,7 @@ def _create(group: h5py.Group, name: str, variable: Variable) -> h5py.Dataset:
     elif data.ndim and data.size:
         options = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
     dataset = group.create_dataset(name, data=data, **options)
-    dataset.attrs["units"] = variable.units
-    dataset.attrs["long_name"] = variable.long_name
-    for key, value in variable.attributes.items():
-        dataset.attrs[key] = value
+    dataset.attrs.update({"units": variable.units, "long_name": variable.long_name, **variable.attributes})
     return dataset
 
 

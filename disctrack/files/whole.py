@@ -50,6 +50,13 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
         raise OutputError(f"{path}: exists. Choose another name or folder, or replace it with --overwrite.")
 
 
+def seen_from(folder: Path, path: Path) -> Path:
+    """The path as seen from the folder; unchanged if it is on another drive."""
+    with contextlib.suppress(ValueError):
+        return Path(os.path.relpath(path, folder))
+    return path
+
+
 def make_folder(folder: Path) -> None:
     """Create the folder and its parents. Raises OutputError."""
     with writing(folder):

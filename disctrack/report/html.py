@@ -4,14 +4,13 @@ Text is escaped here, except `Markup`.
 """
 
 import base64
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from urllib.parse import quote
 
 from disctrack.files.text import printable
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import seen_from, write_whole
 from disctrack.report.blocks import Block, Cell, Drawn, Facts, Figures, Listing, Markup, Report, Section, shown
 from disctrack.report.palette import AMBER, BLUE, GRID, INK, RED
 
@@ -65,7 +64,7 @@ def link_pages(pages: Mapping[str, Path]) -> None:
         before, start, rest = content.partition(NAV[0])
         _, end, after = rest.partition(NAV[1])
         links = "".join(
-            f'<a href="{quote(Path(os.path.relpath(path, own.parent)).as_posix())}">{escape(name)}</a>'
+            f'<a href="{quote(seen_from(own.parent, path).as_posix())}">{escape(name)}</a>'
             for name, path in existing.items()
             if path != own
         )

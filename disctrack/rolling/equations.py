@@ -38,8 +38,6 @@ thetadot, and (2.7) with Omega, the rate of the frame, instead of omega, that of
 The functions accept float and complex numbers: an imaginary part of 1e-30 carries an exact derivative.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TypeAlias
 

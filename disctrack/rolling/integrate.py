@@ -6,8 +6,6 @@ solution. The step control then applies the tolerances of the real solution to t
 to their maximum to the imaginary parts: a law whose amount is zero changes only these.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

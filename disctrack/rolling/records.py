@@ -10,8 +10,6 @@ State vector y (SI, radians); the regimes integrate its first 8, 10 or 12 entrie
     without bound. In contact z follows from theta, and in rolling the velocity of O from omega: they cannot drift.
 """
 
-from __future__ import annotations
-
 from enum import IntEnum
 from typing import Any, TypeAlias
 

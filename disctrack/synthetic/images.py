@@ -1,6 +1,6 @@
 """Images of the disc and of the chessboard on the table, in both cameras."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 
 import numpy as np
@@ -108,24 +108,19 @@ def _add(
         raster.add_shape(near, step, rays, view.R_camera_world @ R, R.T @ (view.centre - t), shape)
 
 
-def _face(stage: Stage, place: Place, disc: Disc, scene: Scene) -> list[tuple[float, Array, float]]:
+def _face(stage: Stage, place: Place, disc: Disc, scene: Scene) -> Iterator[tuple[float, Array, float]]:
     """Circles on the face that is visible to a camera: step of grey, centre in body axes, radius."""
     (R, t), look, top = place, scene.appearance, _top(disc)
     paper = np.array([*scene.faults.pattern_offset_mm, 1e3 * top]) * 1e-3
     height = float(R[:, 2] @ (stage.view.centre - t))
     light = optics.face_brightness(np.sign(height) * R[:, 2], scene)
-    if abs(height) <= top:
-        return []
-    if height < 0:
-        return [(look.underside * light - look.side, np.array([0.0, 0.0, -top]), disc.radius)]
-    return [
-        (look.rim * light - look.side, np.array([0.0, 0.0, top]), disc.radius),
-        ((look.paper - look.rim) * light, paper, disc.radius - 1e-3 * look.rim_width_mm),
-        *(
-            ((look.dot - look.paper) * light, np.array([x, y, top]), disc.marker_diameter / 2)
-            for x, y, _ in disc.marker_centres_body
-        ),
-    ]
+    if height < -top:
+        yield look.underside * light - look.side, np.array([0.0, 0.0, -top]), disc.radius
+    if height > top:
+        yield look.rim * light - look.side, np.array([0.0, 0.0, top]), disc.radius
+        yield (look.paper - look.rim) * light, paper, disc.radius - 1e-3 * look.rim_width_mm
+        for x, y, _ in disc.marker_centres_body:
+            yield (look.dot - look.paper) * light, np.array([x, y, top]), disc.marker_diameter / 2
 
 
 def _top(disc: Disc) -> float:

@@ -9,16 +9,12 @@ follows from signed distances at its corners and its centre. Area and first mome
 corrected for curvature to second order. The error of a blurred edge is of third order in the size of the cells.
 """
 
-from typing import Any
-
 import numpy as np
 from numba import types
 
 from calibration.kit.arrays import Array, Array32
+from calibration.kit.compiled import exact_part as part
 from calibration.kit.compiled import njit
-
-_RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **_RULES)  # called by compiled functions only
 
 _ROUND, _BODY, _SHEET = 0.0, 1.0, 2.0
 _FAR = -1e3  # [m] signed distance of a ray that does not meet the plane in front of the camera
@@ -170,7 +166,7 @@ def _add_crossed(
             _deposit(cells, row * s + i, column * s + j, step * area, step * m_x, step * m_y)
 
 
-@njit(cache=True, **_RULES)
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_shape(cells: Array32, step: float, rays: Array, R: Array, eye: Array, shape: Array) -> None:
     """Add `step` times the covered part of each cell to `cells`.
 

@@ -1,7 +1,5 @@
 """Compiled fit of poses to their dots (numba): Levenberg-Marquardt, one frame after the other; see `pose`."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -73,7 +71,7 @@ def _evaluate(observed, covariance, used, cameras, centres, reach, R, t, filled,
     """
     (pixels, residual, jacobian), (intrinsics, R_cw, t_cw) = filled, cameras
     J, row = np.empty((2, 3)), np.empty((2, 6))
-    sums[:] = 0.0
+    residual[:], jacobian[:], sums[:] = 0.0, 0.0, 0.0
     cost = 0.0
     for c in range(2):
         for m in range(centres.shape[0]):
@@ -82,12 +80,7 @@ def _evaluate(observed, covariance, used, cameras, centres, reach, R, t, filled,
             # W with W C W^T = 1, as in `pose.whitening`; zero weight if C is not a covariance
             a, b = covariance[c, m, 0, 0], covariance[c, m, 0, 1]
             remaining = covariance[c, m, 1, 1] - b * b / a
-            good = used[c, m] and a > 0.0 and 0.0 < remaining < np.inf
-            if not good:
-                for axis in range(2):
-                    residual[c, m, axis] = 0.0
-                    for i in range(6):
-                        jacobian[c, m, axis, i] = 0.0
+            if not (used[c, m] and a > 0.0 and 0.0 < remaining < np.inf):
                 continue
             du, dv = observed[c, m, 0] - u, observed[c, m, 1] - v
             weight = 1.0 / max(1.0, math.hypot(du, dv) / reach)

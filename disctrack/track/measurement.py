@@ -1,24 +1,21 @@
 """The complete measurement: a recording's files, or frames in memory, become a trajectory with its provenance."""
 
-import dataclasses
-import hashlib
-import json
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import FrameRate, Gravity, Threads, Times, checked, grey_values
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import AnyArray
 from calibration.kit.threads import one_blas_thread
 from disctrack.analyse.declaration import Boards, contradictions, with_square
 from disctrack.disc import Disc
 from disctrack.errors import RecordingError, TrackingError
+from disctrack.files.json_text import json_sha256
 from disctrack.findings import Finding, Kind, Severity, of_kind, warn_of_doubts
 from disctrack.frames import CAMERAS
 from disctrack.progress import compiling
@@ -35,7 +32,7 @@ from disctrack.trajectory import FrameStatus, at_full_length
 from disctrack.trajectory.file import Provenance
 
 Progress = Callable[[int], None]
-Images = NDArray[np.generic]  # of any real type; uint8 and uint16 are not copied
+Images = AnyArray  # of any real type; uint8 and uint16 are not copied
 
 WHOLE_BELOW = 2.0  # [s] shorter recordings were cut by the user, and are measured including rest
 BLOCK = 64  # pairs in memory
@@ -141,16 +138,17 @@ def measure(
     """
     check_rig(rig, pairs)
     exposure, headers = exposures(recording, pairs)
-    settings = dataclasses.replace(settings or TrackingSettings(), exposure=exposure)
+    settings = replace(settings or TrackingSettings(), exposure=exposure)
     if recording.table is not None:
-        settings = dataclasses.replace(settings, table=recording.table.source)
+        settings = replace(settings, table=recording.table.source)
     stamps = usable_times(pairs.left, recording.frame_rate)
     with compiling("tracking", 15):  # once per installation, not counted as measuring time
         prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)
     began = time.perf_counter()
     span = _span(pairs, recording.frame_rate, settings)
     progress(len(pairs) - (span.stop - span.start))
-    found = _tracked(recording, rig, pairs, settings, span, stamps, threads or default_threads(), progress)
+    taken = Taken(range(span.start, span.stop), recording.frame_rate, recording.gravity, stamps)
+    found = _tracked(recording, rig, pairs, settings, taken, threads or default_threads(), progress)
     seconds = time.perf_counter() - began
     findings = (
         *pairs.findings,
@@ -162,15 +160,14 @@ def measure(
     details = {
         **found.details,
         "unreadable": [*found.unreadable.values()],
-        "first_pass": dataclasses.asdict(span),
+        "first_pass": asdict(span),
         **pairs.camera_headers(),
     }
     trajectory = at_full_length(found.trajectory, len(pairs.left), span.start, stamps)
     for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
         trajectory.frame_status[still] = FrameStatus.STILL
-    trajectory = dataclasses.replace(trajectory, air_density=recording.air_density)
     findings = contradictions(trajectory, recording.disc, recording, findings, boards, details["blur_px"])
-    trajectory = dataclasses.replace(trajectory, findings=findings)
+    trajectory = replace(trajectory, air_density=recording.air_density, findings=findings)
     warn_of_doubts(findings)
     return Measurement(trajectory, details, found.unreadable, seconds)
 
@@ -225,7 +222,7 @@ def measure_pairs(
     seconds = time.perf_counter() - began
     findings = contradictions(found.trajectory, disc, noticed=found.trajectory.findings)
     warn_of_doubts(findings)
-    return Measurement(dataclasses.replace(found.trajectory, findings=findings), found.details, seconds=seconds)
+    return Measurement(replace(found.trajectory, findings=findings), found.details, seconds=seconds)
 
 
 def _sides(images: Images | tuple[Images, Images]) -> tuple[Images, Images]:
@@ -249,27 +246,23 @@ def _tracked(
     rig: StereoRig,
     pairs: ImagePairs,
     settings: TrackingSettings,
-    span: MotionSpan,
-    stamps: Array | None,
+    taken: Taken,
     threads: int,
     progress: Progress,
 ) -> Measurement:
-    """Track the disc through the span; stamps : times of all frames [s]."""
+    """Track the disc through the pairs taken."""
     not_read: NotRead = {}  # a dictionary, as some images are read twice
-    tracked = range(span.start, span.stop)
     workers = 1  # stretches followed in parallel: one per core, if frames can be read in any order
     if pairs.left.random_access and pairs.right.random_access:
-        workers = max(1, min(threads, len(stretch_edges(tracked, recording.disc)) - 1))
+        workers = max(1, min(threads, len(stretch_edges(taken.pairs, recording.disc)) - 1))
     reading = pairs.reading(not_read, max(1, threads // workers))  # each worker has its own three blocks
-    stamps = None if stamps is None else stamps[span.start : span.stop]
-    taken = Taken(tracked, recording.frame_rate, recording.gravity, stamps)
     try:
         found = track(reading, taken, rig, recording.disc, settings, workers, progress)
     except TrackingError as error:
-        refuse_unreadable(recording, not_read, 2 * len(tracked), error)
+        refuse_unreadable(recording, not_read, 2 * len(taken.pairs), error)
         error.findings = with_square(error.findings, recording)
         raise
-    return dataclasses.replace(found, unreadable=dict(sorted(not_read.items())))
+    return replace(found, unreadable=dict(sorted(not_read.items())))
 
 
 def images_lost(not_read: NotRead) -> tuple[Finding, ...]:
@@ -324,17 +317,11 @@ def trajectory_provenance(
     """
     return Provenance(
         recording=recording.name,
-        inputs={**pairs.inputs(), "rig": rig_sha256(rig)},
+        inputs={**pairs.inputs(), "rig": json_sha256(rig)},
         settings={
             "recording": dict(recording.declared),
             "frames": [pairs.start, pairs.stop],
-            "tracking": dataclasses.asdict(settings or TrackingSettings()),
+            "tracking": asdict(settings or TrackingSettings()),
             **pairs.camera_headers(),
         },
     )
-
-
-def rig_sha256(rig: StereoRig) -> str:
-    """SHA-256 (hex) of all numbers of a rig, at full precision."""
-    numbers = json.dumps(dataclasses.asdict(rig), default=lambda value: value.tolist())
-    return hashlib.sha256(numbers.encode()).hexdigest()

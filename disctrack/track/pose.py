@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import N_RIG, StereoRig, by_turning
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import AnyArray, Array, Indices, Mask
 from calibration.kit.least_squares import normal_of_rows
 from disctrack.analyse.quantities import SIGMAS
 from disctrack.disc import Disc
@@ -34,7 +33,7 @@ class PoseFits:
     residuals_px: Array  # (n, 2, m, 2) observed - projected, also of rejected dots; NaN where a dot was not seen
     used: Mask  # (n, 2, m)
     chi_square: Array  # (n,)
-    degrees_of_freedom: NDArray[np.int64]  # (n,)
+    degrees_of_freedom: AnyArray  # (n,) whole numbers
     converged: Mask  # (n,)
 
     @property
@@ -64,7 +63,7 @@ class DotsInFrames:
         """(n,) True where there is a pose."""
         return np.asarray(np.isfinite(self.t).all(axis=1))
 
-    def at(self, rows: NDArray[np.intp] | slice) -> DotsInFrames:
+    def at(self, rows: Indices | slice) -> DotsInFrames:
         """Some of the frames."""
         parts = {name: getattr(self, name)[rows] for name in ("pixels", "covariance", "R", "t")}
         return replace(self, **parts)
@@ -77,9 +76,10 @@ class DotsInFrames:
         disc = replace(self.disc, marker_centres_body=self.disc.marker_centres_body + moved)
         return replace(self, rig=self.rig.perturbed(shift[:N_RIG]), disc=disc, pixels=pixels)
 
-    def fitted(self, shift: Array, reject: bool) -> tuple[DotsInFrames, PoseFits]:
-        """The frames with poses fitted after the shift; if a fit fails, the pose is kept."""
-        fits = fit_poses(self.shifted(shift), reject_outliers=reject, with_sensitivity=False)
+    def fitted(self, reject: bool, shift: Array | None = None) -> tuple[DotsInFrames, PoseFits]:
+        """The frames with poses fitted, after the shift if there is one; if a fit fails, the pose is kept."""
+        moved = self if shift is None else self.shifted(shift)
+        fits = fit_poses(moved, reject_outliers=reject, with_sensitivity=False)
         ok = fits.converged
         R = np.where(ok[:, None, None], fits.R_world_body, self.R)
         return replace(self, R=R, t=np.where(ok[:, None], fits.t_world_body, self.t)), fits
@@ -177,7 +177,7 @@ def fit_poses(seen: DotsInFrames, *, reject_outliers: bool = True, with_sensitiv
     )
 
 
-def _strike_worst_dot(residual: Array, JW: Array, used: Mask, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+def _strike_worst_dot(residual: Array, JW: Array, used: Mask, rows: Indices) -> Indices:
     """Remove the worst outlier of each of the rows from `used`; returns the rows that must be fitted again.
 
     A dot is an outlier if chi-square decreases without it by more than 2 SIGMAS^2, times the reduced chi-square of the

@@ -1,6 +1,6 @@
 """What a run tells its user at the end, in plain words."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,32 +16,27 @@ from disctrack.trajectory import FrameStatus, Trajectory
 Row = tuple[str, str]  # a heading, and what belongs to it
 
 
-def calibration_rows(found: StereoCalibration, problems: Sequence[str] = ()) -> list[Row]:
+def calibration_rows(found: StereoCalibration, problems: Sequence[str] = ()) -> Iterator[Row]:
     """Views used, misfit of views left out, baseline, the model, what was left out and why."""
     n, assessment = len(found.view_names) + len(problems), found.assessment
     error = f" ({1e6 * assessment.held_out_error:.3g} µm in space)" if np.isfinite(assessment.held_out_error) else ""
     used = n - len(problems) - len(found.rejected_views)
     x, y, z = 1e6 * np.sqrt(np.mean((found.board_points - found.board.points) ** 2, axis=0))
-    lines = [
-        (
-            "calibration",
-            f"{used} of {n} views ({assessment.pairs} by both cameras), stereo misfit of views left out "
-            f"{assessment.stereo_misfit_px:.4f} px{error}, baseline {found.rig.baseline * 1e3:.3f} mm",
-        ),
-        ("place", _mostly(assessment.place_sigma, "the calibration alone, of a point over the table's board")),
-        ("rig", _rig_text(found.rig)),
-        (
-            "board",
-            f"corners off by {x:.1f}, {y:.1f} and {z:.1f} µm rms along its sides and out of its plane, as refined",
-        ),
-    ]
+    yield (
+        "calibration",
+        f"{used} of {n} views ({assessment.pairs} by both cameras), stereo misfit of views left out "
+        f"{assessment.stereo_misfit_px:.4f} px{error}, baseline {found.rig.baseline * 1e3:.3f} mm",
+    )
+    yield "place", _mostly(assessment.place_sigma, "the calibration alone, of a point over the table's board")
+    yield "rig", _rig_text(found.rig)
+    what = "along its sides and out of its plane, as refined"
+    yield "board", f"corners off by {x:.1f}, {y:.1f} and {z:.1f} µm rms {what}"
     if found.lens_rms_px:
         left, right = found.lens_rms_px
-        lines.append(("", f"lenses beyond their polynomials: {left:.3f} and {right:.3f} px rms per axis, corrected"))
-    corners = len(found.rejected_corners())
-    if corners:
-        lines.append(("", f"{corners} corners were found but not used"))
-    return lines + [("", text) for text in left_out(found)]
+        yield "", f"lenses beyond their polynomials: {left:.3f} and {right:.3f} px rms per axis, corrected"
+    if corners := len(found.rejected_corners()):
+        yield "", f"{corners} corners were found but not used"
+    yield from (("", text) for text in left_out(found))
 
 
 def _rig_text(rig: StereoRig) -> str:
@@ -73,32 +68,30 @@ def left_out(found: StereoCalibration) -> list[str]:
     return [f"not used: {', '.join(images)}: {why}" for why, images in found.reasons.items()]
 
 
-def trajectory_rows(trajectory: Trajectory, details: Mapping[str, Any]) -> list[Row]:
+def trajectory_rows(trajectory: Trajectory, details: Mapping[str, Any]) -> Iterator[Row]:
     """Frames measured and lost with the reasons, sigmas, reprojection error."""
-    lines = [*_frame_lines(trajectory)]
+    yield from _frame_lines(trajectory)
     if found := details.get("first_pass"):
         looked = f" (first pass, {found['looked_at']} pairs looked at)" if found["looked_at"] else ""
-        lines.append(("motion", f"{found['verdict']}{looked}"))
+        yield "motion", f"{found['verdict']}{looked}"
     if trajectory.measured.any():
-        lines += [
-            ("sigma", sigma_text(trajectory)),
-            ("", _sigma_text(trajectory.calibration_sigma, "shared by frames: calibration, table, what repeats")),
-            *_shared_lines(details),
-            _fit_row(trajectory),
-        ]
+        yield "sigma", sigma_text(trajectory)
+        yield "", _sigma_text(trajectory.calibration_sigma, "shared by frames: calibration, table, what repeats")
+        yield from _shared_lines(details)
+        yield _fit_row(trajectory)
         if any(repeats := details.get("systematic_px", ())):
             left, right = repeats
             what = "lens beyond its model, printed dots, light"
-            lines.append(("repeating", f"misfit of the dots, left {left:.4f} px, right {right:.4f} px ({what})"))
+            yield "repeating", f"misfit of the dots, left {left:.4f} px, right {right:.4f} px ({what})"
         if table := details.get("table"):
-            lines.append(("table", table["told"]))
+            yield "table", table["told"]
             if least := table.get("least_off_centre"):
                 centred = "the dots' middle is taken for the disc's centre ([markers] centres_mm)"
-                lines.append(("given", f"{centred}; it may be off by up to {1e6 * least:.2g} µm unseen"))
-    return lines + [("image", reason) for reason in list(details.get("unreadable", []))[:SHOWN_RANGES]]
+                yield "given", f"{centred}; it may be off by up to {1e6 * least:.2g} µm unseen"
+    yield from (("image", reason) for reason in list(details.get("unreadable", []))[:SHOWN_RANGES])
 
 
-def _shared_lines(details: Mapping[str, Any]) -> Iterable[Row]:
+def _shared_lines(details: Mapping[str, Any]) -> Iterator[Row]:
     if shared := details.get("shared_sigma"):
         yield ("", _mostly(shared, "shared by frames"))
     size = details.get("size", {})
@@ -123,7 +116,7 @@ def sigma_text(trajectory: Trajectory) -> str:
     return _sigma_text(trajectory.coordinate_sigma, "median of the frames, noise of one frame")
 
 
-def _frame_lines(trajectory: Trajectory) -> Iterable[Row]:
+def _frame_lines(trajectory: Trajectory) -> Iterator[Row]:
     yield ("frames", frames_text(trajectory))
     for status in FrameStatus:
         rows = np.flatnonzero(trajectory.frame_status == status)

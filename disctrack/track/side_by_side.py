@@ -1,9 +1,8 @@
 """Subsets of the frames: parts for parallel work, runs of frames, evenly spread ones."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Mask
+from calibration.kit.arrays import Indices, Mask
 
 AT_ONCE = 512  # frames, whose temporary arrays are many times as large as the result, and fit into a core's cache
 SHARED_FRAMES = 400  # at most, to estimate what all frames share: more frames repeat it
@@ -17,12 +16,12 @@ def parts(n: int) -> list[slice]:
     return [slice(first, first + AT_ONCE) for first in range(0, n, AT_ONCE)]
 
 
-def stretches(chosen: Mask, shortest: int = 1) -> NDArray[np.intp]:
+def stretches(chosen: Mask, shortest: int = 1) -> Indices:
     """(k, 2) first and one past the last frame of every run of at least `shortest` frames in the mask `chosen` (n,)."""
     edges = np.flatnonzero(np.diff(np.r_[False, chosen, False].astype(int))).reshape(-1, 2)
     return np.asarray(edges[edges[:, 1] - edges[:, 0] >= shortest])
 
 
-def evenly(rows: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+def evenly(rows: Indices, most: int) -> Indices:
     """At most `most` of the rows (k,), evenly spread."""
     return rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)]

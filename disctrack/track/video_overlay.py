@@ -4,21 +4,19 @@ import contextlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import AnyArray, Array, Codes, Mask
 from calibration.kit.grey_levels import full_scale
 from disctrack.errors import OutputError
 from disctrack.files.whole import whole_file
 from disctrack.frames import CAMERAS, nodal_axes_world, rotation_from_quaternion
 from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
 
-ColourImage = NDArray[Any]  # (height, width, 3) uint8, BGR
+ColourImage = AnyArray  # (height, width, 3) uint8, BGR
 
 PLAYBACK_HZ = 25.0
 POINTS = 120  # of an outline
@@ -39,7 +37,7 @@ _COLOURS = {  # blue, green, red as OpenCV orders them
 @checked
 def write_overlay(
     path: str | Path,
-    pairs: Iterable[tuple[int, NDArray]],
+    pairs: Iterable[tuple[int, AnyArray]],
     trajectory: Trajectory,
     progress: Callable[[int], None] = lambda n: None,
 ) -> Path:
@@ -72,7 +70,7 @@ def shown_rows(start: int, stop: int) -> range:
     return range(start, stop, max(1, math.ceil((stop - start) / (60 * PLAYBACK_HZ))))
 
 
-def draw_pair(images: NDArray, trajectory: Trajectory, row: int) -> ColourImage:
+def draw_pair(images: AnyArray, trajectory: Trajectory, row: int) -> ColourImage:
     """Both images side by side, (height, 2 width, 3) BGR, with what row `row` of the trajectory says.
 
     images : (2, height, width) uint8 or uint16
@@ -146,17 +144,15 @@ def _circle() -> Array:
 
 
 def _polylines(picture: ColourImage, lines: Sequence[Array] | Array, colour: str, closed: bool = True) -> None:
-    exact = np.asarray(lines)
-    finite: Mask = np.asarray(np.isfinite(exact).all(axis=2))  # not behind a camera, nor out of the lens's reach
-    whole = np.clip(np.rint(np.where(finite[..., None], 2**_SUBPIXEL_BITS * exact, 0.0)), -(2**24), 2**24).astype(
-        np.int32
-    )
+    fine = 2**_SUBPIXEL_BITS * np.asarray(lines)
+    finite: Mask = np.asarray(np.isfinite(fine).all(axis=2))  # not behind a camera, nor out of the lens's reach
+    whole = np.rint(np.clip(np.where(finite[..., None], fine, 0.0), -(2**24), 2**24)).astype(np.int32)
     fixed = [line[seen, None] for line, seen in zip(whole, finite, strict=True) if seen.sum() > 1]
     if fixed:
         cv2.polylines(picture, fixed, closed, _COLOURS[colour], 1, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
-def _draw_centres(picture: ColourImage, pixels: Array, status: NDArray[np.uint8]) -> None:
+def _draw_centres(picture: ColourImage, pixels: Array, status: Codes) -> None:
     for point, state in zip(pixels, status, strict=True):
         if np.isfinite(point).all():
             _cross(picture, point, "centre" if state == MarkerStatus.MEASURED else "refused", cv2.MARKER_CROSS, 7)

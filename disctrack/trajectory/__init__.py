@@ -8,10 +8,9 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import AnyArray, Array, Codes, Indices, Mask
 from calibration.kit.brief import Brief
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.findings import Finding
@@ -91,20 +90,20 @@ class Trajectory(Brief):
     held_as: ClassVar[str] = "trajectory"
 
     time: Array  # (n,) [s] of mid exposure: i / frame_rate for frame i, or the camera's timestamps
-    frame: NDArray[np.int64]  # (n,) number of the frame in its sequence
+    frame: Indices  # (n,) number of the frame in its sequence
     q: Array  # (n, 6) x, y, z [m], psi, theta, phi [rad] unwrapped
     pose_covariance: Array  # (n, 6, 6) noise of this frame, in POSE_COMPONENTS (frames.py); without calibration
     calibration_sensitivity: Array  # (n, 6, 30) d pose / d RIG_PARAMETERS at fixed pixels; common to all frames
     # (n, 6, 6) constant and slowly varying errors other than the rig's: misfit of the dots beyond noise
     systematic_covariance: Array
     quaternion: Array  # (n, 4) w, x, y, z; body to world, continuous
-    frame_status: NDArray[np.uint8]  # (n,) FrameStatus
+    frame_status: Codes  # (n,) FrameStatus
     reprojection_rms_px: Array  # (n, 2) per camera
     reduced_chi_square: Array  # (n,) of the pose fit
     markers_px: Array  # (n, 2, m, 2) images of the dots' centres, not centres of the ellipses
     markers_covariance_px2: Array  # (n, 2, m, 2, 2)
     markers_residual_px: Array  # (n, 2, m, 2) observed - projected
-    marker_status: NDArray[np.uint8]  # (n, 2, m) MarkerStatus
+    marker_status: Codes  # (n, 2, m) MarkerStatus
     disc: Disc  # with the marker centres that the fits used, refined or declared
     rig: StereoRig
     frame_rate: float  # [Hz]
@@ -164,7 +163,7 @@ class Trajectory(Brief):
         return coordinate_sigma(self.q, self.calibration_covariance)
 
 
-def _changed(trajectory: Trajectory, change: Callable[[str, NDArray], NDArray]) -> Trajectory:
+def _changed(trajectory: Trajectory, change: Callable[[str, AnyArray], AnyArray]) -> Trajectory:
     """Copy with `change` (name, array -> array) applied to all arrays, which have one row per frame."""
     arrays = {name: value for name, value in vars(trajectory).items() if isinstance(value, np.ndarray)}
     changed: dict[str, Any] = {name: change(name, value) for name, value in arrays.items()}
@@ -197,7 +196,7 @@ def at_full_length(part: Trajectory, n: int, start: int, timestamps: Array | Non
 _FILL = {"frame_status": FrameStatus.NOT_PROCESSED, "marker_status": MarkerStatus.NOT_LOOKED_FOR}
 
 
-def among(n: int, start: int, rows: NDArray, fill: float | None = None) -> NDArray:
+def among(n: int, start: int, rows: AnyArray, fill: float | None = None) -> AnyArray:
     """Rows of frames start.. in an array of n frames; the others are `fill`, by default NaN, or 0 for integers."""
     empty = np.nan if rows.dtype.kind == "f" else 0
     whole = np.full((n, *rows.shape[1:]), empty if fill is None else fill, rows.dtype)

@@ -7,7 +7,6 @@ reprojection_rms_px, status; groups `markers`, `disc`, `calibration`, and those 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
 import json
 import platform
@@ -18,17 +17,16 @@ from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import RIG_PARAMETERS, StereoRig
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Mask
+from calibration.kit.arrays import AnyArray, Mask
 from calibration.kit.brief import Brief
 from calibration.kit.seal import sealed
 from calibration.rig_file import beside_cameras, complete_file, read_beside_cameras, versions, write_attributes
 from disctrack.disc import Disc
 from disctrack.errors import OutputError, TrajectoryFileError, told_as
-from disctrack.files.json_text import json_text
+from disctrack.files.json_text import json_sha256, json_text
 from disctrack.files.labelled_arrays import Variable, copy_without, flags, read_array, write_variables
 from disctrack.files.software import software_version
 from disctrack.files.whole import refuse_existing, write_whole
@@ -78,8 +76,7 @@ class Provenance(Brief):
     @property
     def fingerprint(self) -> str:
         """SHA-256 (hex) of inputs, settings and version."""
-        content = {"inputs": dict(self.inputs), "settings": dict(self.settings), "version": self.version}
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+        return json_sha256({"inputs": dict(self.inputs), "settings": dict(self.settings), "version": self.version})
 
 
 @checked
@@ -107,7 +104,7 @@ def write_trajectory(
         write_variables(file.create_group("markers", track_order=True), _variables(trajectory, "markers"))
         dots = Variable(trajectory.disc.marker_centres_body, ("marker", "space_axis"), "m", "dots, body frame, as used")
         write_variables(file.create_group("disc", track_order=True), {"marker_centres_body": dots})
-        file["disc"].attrs.update(_disc_sizes(trajectory.disc))
+        file["disc"].attrs.update(disc_sizes(trajectory.disc))
         _write_rig(file.create_group("calibration", track_order=True), trajectory)
         file.attrs.update(_root_attributes(trajectory, provenance))
         file.attrs["findings"] = json_text([finding.as_json() for finding in trajectory.findings])
@@ -241,7 +238,7 @@ def write_groups(path: Path, groups: Mapping[str, Group], axes: Mapping[str, Var
 @checked
 def read_group(
     path: str | Path, group: str, names: Collection[str] | None = None
-) -> tuple[dict[str, NDArray], dict[str, Any]]:
+) -> tuple[dict[str, AnyArray], dict[str, Any]]:
     """Arrays and attributes of one group. Raises TrajectoryFileError that lists the groups of the file.
 
     names : of the arrays to read; by default all
@@ -259,12 +256,10 @@ def read_group(
         return arrays, dict(file[group].attrs)
 
 
-def labelled(trajectory: Trajectory) -> tuple[dict[str, Variable], dict[str, Variable], dict[str, float]]:
-    """Variables of the file's root and of its dots (`marker_...`), axes, and numbers of the whole recording."""
+def labelled(trajectory: Trajectory) -> dict[str, Variable]:
+    """Variables of the file's root and of its dots (`marker_...`)."""
     dots = {f"marker_{name}": item for name, item in _variables(trajectory, "markers").items()}
-    sizes = _disc_sizes(trajectory.disc).items()
-    numbers = _recording_numbers(trajectory) | {f"disc_{name}": value for name, value in sizes}
-    return _root_variables(trajectory) | dots, _axes(trajectory), numbers
+    return _root_variables(trajectory) | dots
 
 
 def to_xarray(trajectory: Trajectory) -> xarray.Dataset:
@@ -278,9 +273,11 @@ def to_xarray(trajectory: Trajectory) -> xarray.Dataset:
     def described(item: Variable) -> tuple:
         return item.dims, np.asarray(item.data), {"units": item.units, "long_name": item.long_name, **item.attributes}
 
-    variables, axes, numbers = labelled(trajectory)
+    variables = labelled(trajectory)
     used = {axis for item in variables.values() for axis in item.dims}
-    coordinates = {name: described(axis) for name, axis in axes.items() if name in used}
+    coordinates = {name: described(axis) for name, axis in _axes(trajectory).items() if name in used}
+    numbers = recording_numbers(trajectory)
+    numbers |= {f"disc_{name}": value for name, value in disc_sizes(trajectory.disc).items()}
     return xarray.Dataset({name: described(item) for name, item in variables.items()}, coordinates, numbers)
 
 
@@ -288,7 +285,8 @@ def to_xarray(trajectory: Trajectory) -> xarray.Dataset:
 _NUMBERS = {"frame_rate": "frame_rate_hz", "gravity": "gravity_m_s2", "air_density": "air_density_kg_m3"}
 
 
-def _recording_numbers(trajectory: Trajectory) -> dict[str, float]:
+def recording_numbers(trajectory: Trajectory) -> dict[str, float]:
+    """Numbers of the whole recording, as the file's root has them."""
     return {key: getattr(trajectory, name) for name, key in _NUMBERS.items()}
 
 
@@ -303,7 +301,7 @@ def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str
         "inputs_sha256": json.dumps(dict(provenance.inputs), sort_keys=True),
         "settings": json.dumps(dict(provenance.settings), sort_keys=True),
         "fingerprint": provenance.fingerprint,
-        **_recording_numbers(trajectory),
+        **recording_numbers(trajectory),
         "table_moved_m_rad": trajectory.table_moved,
         **_CONVENTIONS,
     }
@@ -415,7 +413,8 @@ _DISC_SIZES = (
 )  # fmt: skip
 
 
-def _disc_sizes(disc: Disc) -> dict[str, float]:
+def disc_sizes(disc: Disc) -> dict[str, float]:
+    """Sizes of the disc in SI units, as the group `disc` has them."""
     sizes = {name: getattr(disc, name.rpartition("_")[0]) for name in _DISC_SIZES}
     return {name: value for name, value in sizes.items() if value is not None}
 
@@ -463,7 +462,7 @@ def _trajectory(file: h5py.File) -> Trajectory:
     return trajectory
 
 
-def _array(file: h5py.File, place: str, unit: str) -> NDArray:
+def _array(file: h5py.File, place: str, unit: str) -> AnyArray:
     """Values of a dataset. Raises ValueError if their unit is not the one that this program writes."""
     found = str(file[place].attrs.get("units", unit))
     if found != unit:

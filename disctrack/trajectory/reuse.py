@@ -1,13 +1,12 @@
 """Reuse of results of the stages after a trajectory, if they are complete and of the same origin and version."""
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from disctrack.files.json_text import json_file, plain
+from disctrack.files.json_text import json_file, json_sha256, plain
 from disctrack.files.software import software_version
 from disctrack.files.whole import write_whole
 from disctrack.report.blocks import Report, document, restored
@@ -29,7 +28,7 @@ def content_of(name: str) -> str:
 
 def hash_of(content: Any) -> str:
     """SHA-256 (hex) of content in JSON types, and of the version."""
-    return hashlib.sha256(json.dumps([content, software_version()], sort_keys=True).encode()).hexdigest()
+    return json_sha256([content, software_version()])
 
 
 def remember(folder: Path, origin: str, report: Report, files: Sequence[Path]) -> None:

@@ -8,8 +8,6 @@ components that a law may set (records.WRENCH): M_n, M_m, M_z [N m]; load_n, loa
 [m]; X_n, X_m, X_z [N].
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Callable, Mapping
 from functools import lru_cache

@@ -9,8 +9,6 @@ it calls. So there are few functions; slices are not assigned (the error message
 takes longer to compile than a loop); and only functions that Python calls are Python entry points.
 """
 
-from __future__ import annotations
-
 import math
 from collections import namedtuple
 from typing import NamedTuple
@@ -78,12 +76,8 @@ _T = _f(0.3275911 / math.sqrt(2.0))
 _ERFC = tuple(_f(0.5 * a) for a in (0.254829592, -0.284496736, 1.421413741, -1.453152027, 1.061405429))
 # exp(-z^2 / 2) = e^16, e = exp(-z^2 / 32) a polynomial in z^2: 6e-8 for |z| < 6
 _Z2_MAX = _f(36.0)
-_EXP = tuple(
-    _f(c)
-    for c in np.polynomial.Chebyshev.interpolate(lambda z2: np.exp(-z2 / 32.0), 6, domain=[0.0, 36.0])
-    .convert(kind=np.polynomial.Polynomial)
-    .coef
-)
+_SERIES = np.polynomial.Chebyshev.interpolate(lambda z2: np.exp(-z2 / 32.0), 6, domain=[0.0, 36.0])
+_EXP = tuple(map(_f, _SERIES.convert(kind=np.polynomial.Polynomial).coef))
 
 
 @_part
@@ -446,15 +440,11 @@ def _fit_dot(image, map_x, map_y, camera, point, R, face, own, sigma, noise, pix
         blurred = 1.0 / largest < _MIN_SEMI_MINOR * blur
         band = 3.0 * p[ROW.sigma] + 1.0
         extent_x, extent_y = math.hypot(G[3, 0], G[3, 1]) + band, math.hypot(G[4, 0], G[4, 1]) + band
-        window = (
-            int(math.floor(u0 - extent_x)),
-            int(math.ceil(u0 + extent_x)),
-            int(math.floor(v0 - extent_y)),
-            int(math.ceil(v0 + extent_y)),
-        )
-        if window[0] < 1 or window[2] < 1 or window[1] > width - 2 or window[3] > height - 2:
+        x_lo, x_hi = int(math.floor(u0 - extent_x)), int(math.ceil(u0 + extent_x))
+        y_lo, y_hi = int(math.floor(v0 - extent_y)), int(math.ceil(v0 + extent_y))
+        if x_lo < 1 or y_lo < 1 or x_hi > width - 2 or y_hi > height - 2:
             return OUTSIDE
-        room = (window[1] - window[0] + 1) * (window[3] - window[2] + 1) + 1
+        window, room = (x_lo, x_hi, y_lo, y_hi), (x_hi - x_lo + 1) * (y_hi - y_lo + 1) + 1
         if room > pixels.shape[1]:
             pixels = np.empty((16, room), np.float32)
         n, inside, outside = _select_pixels(image, map_x, map_y, P, face, own, window, G, largest, p, u0, v0, pixels)

@@ -5,21 +5,20 @@ candidate poses. If one camera sees too few dots, three blobs of the other give 
 problem). Of mirror-image solutions the one that touches the table is chosen.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations, permutations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig, normalise, triangulate
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import AnyArray, Array
 from calibration.kit.grey_levels import level_step
 from disctrack.analyse.declaration import SIDE_TOLERANCE
 from disctrack.disc import Disc
 from disctrack.faults.dots import marker_pixels
 from disctrack.frames import CAMERAS, euler_from_rotation, rotation_from_vector
-from disctrack.track.pose import MIN_DOTS, DotsInFrames, fit_poses
+from disctrack.track.pose import MIN_DOTS, DotsInFrames
 
 MAX_BLOBS = 24
 EPIPOLAR_PX = 4.0  # centroids of blobs err by up to 1 px under glare, the rig by much less
@@ -30,7 +29,7 @@ CANDIDATES = 40  # poses that are refined
 Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]
 
 
-def dot_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Array:
+def dot_blobs(image: AnyArray, expected_diameter_px: float) -> Array:
     """Centroids and areas (k, 3) of elliptical blobs, dark on light and light on dark, most elliptical first.
 
     x, y [px], area [px^2]. The threshold is relative to the local mean, so uneven light does not matter. The area of a
@@ -43,16 +42,13 @@ def dot_blobs(image: NDArray[np.generic], expected_diameter_px: float) -> Array:
     spread = np.median(np.abs(smooth - mean))
     # relative to the local mean, against gradients of glare; three spreads at least, for dim images
     threshold = np.maximum(0.12 * mean, 3.0 * spread)
-    found = []
-    for mask in (smooth < mean - threshold, smooth > mean + threshold):
-        found += _elliptical_components(mask.astype(np.uint8), expected_diameter_px)
-    found.sort()
+    masks = smooth < mean - threshold, smooth > mean + threshold
+    found = sorted(blob for mask in masks for blob in _elliptical_components(mask, expected_diameter_px))
     return np.array([blob[1:] for blob in found[:MAX_BLOBS]], float).reshape(-1, 3)
 
 
-def _elliptical_components(mask: NDArray[np.uint8], diameter: float) -> list[tuple[float, float, float, float]]:
-    contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    result = []
+def _elliptical_components(mask: AnyArray, diameter: float) -> Iterator[tuple[float, float, float, float]]:
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     for contour in contours:
         if len(contour) < 8:
             continue
@@ -67,8 +63,7 @@ def _elliptical_components(mask: NDArray[np.uint8], diameter: float) -> list[tup
             continue
         misfit = abs(area / (4 * np.pi * np.sqrt(major * minor)) - 1.0)
         if misfit < 0.08 and 2 * np.sqrt(major) < 1.3 * diameter:
-            result.append((misfit, moments["m10"] / area, moments["m01"] / area, area))
-    return result
+            yield misfit, moments["m10"] / area, moments["m01"] / area, area
 
 
 def expected_diameter_px(rig: StereoRig, disc: Disc) -> list[float]:
@@ -81,7 +76,7 @@ def expected_diameter_px(rig: StereoRig, disc: Disc) -> list[float]:
 
 
 def acquire(
-    pair: Sequence[NDArray] | NDArray, rig: StereoRig, disc: Disc, by_one: bool = True
+    pair: Sequence[AnyArray] | AnyArray, rig: StereoRig, disc: Disc, by_one: bool = True
 ) -> tuple[Pose | None, int, str]:
     """Find the disc in the images of both cameras, at any position and attitude.
 
@@ -115,7 +110,7 @@ def acquire_from_blobs(
 
 
 def seen_by_one_camera(
-    image: NDArray[np.generic], camera: int, diameter_px: float, rig: StereoRig, disc: Disc
+    image: AnyArray, camera: int, diameter_px: float, rig: StereoRig, disc: Disc
 ) -> tuple[Array, Array, Array]:
     """Dots identified by one camera among blobs of about this diameter, and the pose R_world_body, t_world_body.
 
@@ -242,10 +237,8 @@ def _best_explanation(
             if len(points):
                 gap = _gaps(R, t, points, camera, rig, disc)
                 matched[:, camera] = np.where((gap.min(axis=2) < 1)[..., None], points[gap.argmin(axis=2)], np.nan)
-        seen = DotsInFrames(rig, disc, matched, covariance, R, t)
-        fits = fit_poses(seen, reject_outliers=False, with_sensitivity=False)
-        R = np.where(fits.converged[:, None, None], fits.R_world_body, R)
-        t = np.where(fits.converged[:, None], fits.t_world_body, t)
+        seen, fits = DotsInFrames(rig, disc, matched, covariance, R, t).fitted(reject=False)
+        R, t = seen.R, seen.t
     explained = np.isfinite(matched).all(-1).sum((1, 2))
     rms = BLOB_PX * np.sqrt(fits.chi_square / np.maximum(explained, 1))
     # each dot explained is worth 2 px of rms; each half thickness off the table costs 0.5 px

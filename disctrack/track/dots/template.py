@@ -22,9 +22,8 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array, Image, robust_sigma
+from calibration.kit.arrays import AnyArray, Array, Codes, Image, robust_sigma
 from calibration.kit.grey_levels import level_step
 from disctrack.disc import Disc
 from disctrack.trajectory import MarkerStatus
@@ -60,7 +59,7 @@ def rough_noise(image: Image) -> NoiseModel:
     return NoiseModel(sigma**2, 0.0, float(level_step(image)))
 
 
-def residual_noise(assumed: NoiseModel, results: NDArray) -> NoiseModel:
+def residual_noise(assumed: NoiseModel, results: AnyArray) -> NoiseModel:
     """Noise model from the residuals on the dark and on the light side of the dots' edges; includes any misfit.
 
     results (k,) of fits with the `assumed` noise. Half of the pixels of each side lie within the blurred edge, so a
@@ -88,7 +87,7 @@ def face_of(disc: Disc) -> tuple[Array, float, float]:
     return centres, 0.5 * disc.marker_diameter, rim
 
 
-def dot_centres(results: NDArray, status: NDArray[np.uint8]) -> tuple[NDArray, Array, Array]:
+def dot_centres(results: AnyArray, status: Codes) -> tuple[AnyArray, Array, Array]:
     """Results (..., m) of DOT from the kernels, NaN unless their status (..., m) is MEASURED, and the dots' centres.
 
     Centres are pixels (..., m, 2) with covariance (..., m, 2, 2) [px^2].

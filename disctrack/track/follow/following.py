@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig, normalised_maps
-from calibration.kit.arrays import Array, Image, Mask
+from calibration.kit.arrays import AnyArray, Array, Codes, Image, Mask
 from calibration.kit.grey_levels import saturation_level
 from disctrack.disc import Disc, symmetry_order
 from disctrack.frames import rotation_from_vector, rotation_z, vector_from_rotation
@@ -66,12 +65,12 @@ def maps_of(rig: StereoRig) -> tuple[Array, Array]:
 class Tables:
     """Results of every pair, kept until the poses are fitted: 1.2 kB per pair with six dots."""
 
-    results: NDArray  # (n, 2, m) of `_kernels.DOT`
-    status: NDArray[np.uint8]  # (n, 2, m)
+    results: AnyArray  # (n, 2, m) of `_kernels.DOT`
+    status: Codes  # (n, 2, m)
     R: Array  # (n, 3, 3)
     t: Array  # (n, 3)
-    frame_status: NDArray[np.uint8]  # (n,)
-    digest: NDArray[np.uint64]  # (n, 2) checksum of some rows of each image; 0 if there is no image
+    frame_status: Codes  # (n,)
+    digest: AnyArray  # (n, 2) checksum of some rows of each image; 0 if there is no image
 
     def part(self, rows: slice) -> Tables:
         """Views of some rows."""
@@ -159,7 +158,7 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
         follower.lost = 0 if i < n else None
 
 
-def _digests(images: Image) -> NDArray[np.uint64]:
+def _digests(images: Image) -> AnyArray:
     """(n, 2) checksums of images (n, 2, height, width), never 0: sums of words over some rows, which differ by noise.
 
     The cost is that of reading the rows from memory: fewer of large images suffice.
@@ -170,7 +169,7 @@ def _digests(images: Image) -> NDArray[np.uint64]:
     return np.maximum(words.sum(axis=-1), 1)
 
 
-def repeats(digest: NDArray[np.uint64]) -> Mask:
+def repeats(digest: AnyArray) -> Mask:
     """(n, 2) True if an image equals one of the REPEAT_REACH before it; digest (n, 2), 0 if there is no image."""
     repeated = np.zeros(digest.shape, bool)
     for back in range(1, min(REPEAT_REACH, len(digest) - 1) + 1):
@@ -213,7 +212,7 @@ def _holds(follower: Follower, heading: Heading, images: Image, readable: Mask) 
     return False
 
 
-def _enough(status: NDArray[np.uint8]) -> bool:
+def _enough(status: Codes) -> bool:
     """True if a pose with dots of this status (1, 2, m) cannot be due to chance."""
     found = int(np.sum(status == MarkerStatus.MEASURED))
     return found >= min(MIN_TO_BEGIN, status.shape[-1])
@@ -288,7 +287,7 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, h
     follower.edges, follower.saturated, follower.measured = tuple(edges), tuple(saturated), True
 
 
-def _saturated(images: Image, fits: NDArray, noise: NoiseModel) -> int | None:
+def _saturated(images: Image, fits: AnyArray, noise: NoiseModel) -> int | None:
     """Grey value at which the brighter side of the edges of dots (k,) of DOT is clipped; None if it is not."""
     saturation = saturation_level(images)
     level = float(np.median(fits["level"] * (1.0 - np.minimum(fits["contrast"], 0.0))))

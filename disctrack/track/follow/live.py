@@ -7,11 +7,10 @@ of the dots, their scatter) is not known yet: so use a disc that was measured be
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import checked, grey_values
-from calibration.kit.arrays import Array, Image
+from calibration.kit.arrays import AnyArray, Array, Image
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.errors import ArgumentError
@@ -87,11 +86,6 @@ class Tracker:
         Raises ArgumentError if they are no images, TrackingError if the rig was calibrated at another size.
         """
         self.frame += 1
-        images, rows = self._as_block(left, right), empty_tables(1, self.disc.n_markers)
-        follow_block(self._follower, images, np.ones((1, 2), bool), rows, 0)
-        return self._pose(rows)
-
-    def _as_block(self, left: Image, right: Image) -> NDArray:
         left, right = grey_values(left, "left"), grey_values(right, "right")
         if left.dtype != right.dtype or left.shape != right.shape or left.ndim != 2:
             raise ArgumentError(
@@ -99,7 +93,10 @@ class Tracker:
                 "(height, width), both of one type"
             )
         check_images(left.shape[::-1], self.rig)
-        return np.stack([left, right])[None]
+        images: AnyArray = np.stack([left, right])[None]
+        rows = empty_tables(1, self.disc.n_markers)
+        follow_block(self._follower, images, np.ones((1, 2), bool), rows, 0)
+        return self._pose(rows)
 
     def _pose(self, rows: Tables) -> LivePose:
         """Pose of one pair from its row of the tables; without a pose the pair has no dots either."""

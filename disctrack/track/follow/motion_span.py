@@ -11,15 +11,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array32, robust_sigma
+from calibration.kit.arrays import AnyArray, Array32, robust_sigma
 from calibration.kit.grey_levels import level_step
 from disctrack.analyse.quantities import SIGMAS
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader
 
-Pair = tuple[NDArray, NDArray]
+Pair = tuple[AnyArray, AnyArray]
 
 STRIDE = 16  # frames between two samples; irregular by up to 5, so that no period of the disc is in step with them
 MARGIN = 0.25  # [s] kept before the last frame at rest: a disc that tips over starts too slowly to be seen
@@ -38,7 +37,7 @@ class MotionSpan:
     verdict: str
 
 
-def still_scene(first: NDArray, second: NDArray) -> Callable[[NDArray], bool]:
+def still_scene(first: AnyArray, second: AnyArray) -> Callable[[AnyArray], bool]:
     """Test for motion from two images at rest: has an image changed by more than noise and global brightness?"""
     mean = _reduced(first)
     steep = np.hypot(cv2.Sobel(mean, -1, 1, 0, scale=0.125), cv2.Sobel(mean, -1, 0, 1, scale=0.125))
@@ -47,7 +46,7 @@ def still_scene(first: NDArray, second: NDArray) -> Callable[[NDArray], bool]:
     centred = mean - mean.mean()
     square = float(np.vdot(centred, centred)) or 1.0
 
-    def differs(image: NDArray) -> bool:
+    def differs(image: AnyArray) -> bool:
         now = _reduced(image)
         gain = float(np.vdot(centred, now)) / square
         z = np.abs(now - float(now.mean()) - gain * centred) * weight
@@ -56,7 +55,7 @@ def still_scene(first: NDArray, second: NDArray) -> Callable[[NDArray], bool]:
     return differs
 
 
-def _reduced(image: NDArray) -> Array32:
+def _reduced(image: AnyArray) -> Array32:
     """Means of two by two pixels, in steps of the grey value, so that the bit depth does not matter."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
     whole = image[: 2 * height, : 2 * width].astype(np.float32) / np.float32(level_step(image))
@@ -79,8 +78,6 @@ def find_motion(left: FrameReader, right: FrameReader, start: int, stop: int, fr
     Frames that cannot be read are skipped.
     """
     margin = max(int(np.ceil(MARGIN * frame_rate)), 2 * STRIDE)
-    if stop - start < 2 * margin:
-        return MotionSpan(start, stop, 0, "too short to leave anything out")
     last_still, looked = _last_still(left, right, range(start, stop))
     if last_still is None:
         return MotionSpan(start, stop, looked, "nothing moves in the whole recording")

@@ -9,10 +9,10 @@ from dataclasses import replace
 from threading import Event, Lock
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
 from calibration.cameras.camera import Camera, StereoRig
-from calibration.kit.arrays import Mask
+from calibration.kit.arrays import AnyArray, Mask
 from calibration.kit.grey_levels import mosaic_gains
 from calibration.kit.stuck_pixels import repair, stuck_pixels
 from disctrack import frames
@@ -144,7 +144,7 @@ def _without(read_blocks: ReadBlocks, camera: int, since: int) -> ReadBlocks:
     return lambda start, stop: map(without, read_blocks(start, stop))
 
 
-def _conflicts(tracking: Measurement, noticed: tuple[Finding, ...], read_blocks: ReadBlocks, pairs: range) -> NDArray:
+def _conflicts(tracking: Measurement, noticed: tuple[Finding, ...], read_blocks: ReadBlocks, pairs: range) -> AnyArray:
     """(k, 2, height, width) images whose dots contradict the declaration; none if the recording agrees with it."""
     kinds = {finding.kind for finding in noticed}
     status = tracking.trajectory.frame_status
@@ -204,7 +204,7 @@ def _followed(
     return followers, tables
 
 
-def _some(read_blocks: ReadBlocks, pairs: range) -> NDArray:
+def _some(read_blocks: ReadBlocks, pairs: range) -> AnyArray:
     """(k, 2, height, width) images of some of the pairs, evenly spread, that can be read."""
     chosen = evenly(np.array(pairs), SAMPLE).tolist()
     found = [block.images[block.readable.all(axis=1)].copy() for i in chosen for block in read_blocks(i, i + 1)]
@@ -256,7 +256,7 @@ def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, l
     ]
 
 
-def _without_mosaic(images: NDArray, gains: NDArray) -> NDArray:
+def _without_mosaic(images: AnyArray, gains: AnyArray) -> AnyArray:
     """Images (..., height, width), uint8 or uint16, divided by the gains (2, 2) of the colour filter."""
     height, width = images.shape[-2:]
     pattern = np.tile(gains, (height // 2 + 1, width // 2 + 1))[:height, :width]

@@ -16,10 +16,9 @@ a rotation explains hardly any of them.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, WORLD_SHIFT, WORLD_TURN, StereoRig
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array, Indices, Mask
 from disctrack.analyse.quantities import SIGMAS
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS, vector_from_rotation
@@ -72,7 +71,7 @@ def frames_ahead(left: Array, right: Array) -> int:
     return best if one and misfit[best] ** 2 < (1 - LATE) * misfit[0] ** 2 else 0
 
 
-def delay_of_right(seen: DotsInFrames, rows: NDArray[np.intp]) -> tuple[float, float]:
+def delay_of_right(seen: DotsInFrames, rows: Indices) -> tuple[float, float]:
     """Frame periods by which the right camera is ahead in these frames, and the fraction of the misfit explained by it.
 
     (0, 0) if no frame has both neighbours.

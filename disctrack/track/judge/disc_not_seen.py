@@ -17,10 +17,9 @@ from itertools import chain, islice
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig, triangulate
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import AnyArray, Array, Mask
 from disctrack.analyse.declaration import SIDE_TOLERANCE, other_scale
 from disctrack.disc import Disc, has_mirror_axis
 from disctrack.findings import NONSENSE, Finding, Kind, Remedy, Severity, Subject
@@ -31,7 +30,7 @@ from disctrack.track.judge.doubts import misplaced_dots
 from disctrack.track.pose import MIN_DOTS, DotsInFrames, dots_at
 from disctrack.track.refine.self_calibration import declared_places_kept, fit_shared
 
-Turn = Callable[[NDArray], NDArray]
+Turn = Callable[[AnyArray], AnyArray]
 MIRRORED: dict[str, Turn] = {
     "mirrored left to right": np.fliplr,
     "mirrored top to bottom": np.flipud,
@@ -44,7 +43,7 @@ MISPLACED = 0.2  # relative error of distances between dots: measured with a rul
 MEETING_PX = 2 * acquisition.BLOB_PX  # misfit beyond which cameras or clocks contradict each other
 
 
-def why_not_seen(pairs: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
+def why_not_seen(pairs: AnyArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
     """The first explanation that holds, if any; pairs (n, 2, height, width) evenly spread over the recording."""
     few = pairs[:: max(1, len(pairs) // 2)][:2]
     explained = chain(
@@ -55,7 +54,7 @@ def why_not_seen(pairs: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, .
     return tuple(islice(explained, 1))
 
 
-def arrangement_found(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding]:
+def arrangement_found(pair: AnyArray, rig: StereoRig, disc: Disc) -> Iterator[Finding]:
     """The transformation of the images without which the disc is found.
 
     pair : (2, height, width). All dots but one must be found in both cameras, and more than in the images as declared.
@@ -74,7 +73,7 @@ def arrangement_found(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Fin
         yield Finding(kind, Severity.DOUBT, text, remedies=tuple(remedies), explains=NONSENSE)
 
 
-def _ways(pair: NDArray, disc: Disc) -> Iterator[tuple[str, tuple[NDArray, NDArray], Disc]]:
+def _ways(pair: AnyArray, disc: Disc) -> Iterator[tuple[str, tuple[AnyArray, AnyArray], Disc]]:
     """Possible transformations of the images, with the images and the disc after undoing them."""
     left, right = pair
     yield "the left and right images are exchanged", (right, left), disc
@@ -89,7 +88,7 @@ def _ways(pair: NDArray, disc: Disc) -> Iterator[tuple[str, tuple[NDArray, NDArr
         yield "the dots are those of [markers] as a mirror shows them", (left, right), seen_in_a_mirror
 
 
-def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding]:
+def moved_camera(pairs: AnyArray, rig: StereoRig, disc: Disc) -> Iterator[Finding]:
     """Motion of the right camera relative to the left one, if it explains the dots.
 
     pairs : (n, 2, height, width), evenly spread; both cameras must see the dots in most of them
@@ -119,7 +118,7 @@ def moved_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> Iterator[Finding
         yield Finding(Kind.CAMERA_MOVED, Severity.DOUBT, text, Subject("track", "right"), sizes, advice, NONSENSE)
 
 
-def _by_each_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> DotsInFrames:
+def _by_each_camera(pairs: AnyArray, rig: StereoRig, disc: Disc) -> DotsInFrames:
     """Dots identified among blobs by each camera alone, in pairs (n, 2, height, width), with poses by the left one."""
     diameters = acquisition.expected_diameter_px(rig, disc)
     seen = [[acquisition.seen_by_one_camera(pair[c], c, diameters[c], rig, disc) for c in (0, 1)] for pair in pairs]
@@ -129,7 +128,7 @@ def _by_each_camera(pairs: NDArray, rig: StereoRig, disc: Disc) -> DotsInFrames:
     return DotsInFrames(rig, disc, pixels, covariance, R, t)
 
 
-def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
+def unlike_declared(pair: AnyArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
     """Which declared number contradicts the images, and its value, if it can be determined.
 
     pair : (2, height, width), images of the left and the right camera
@@ -156,7 +155,7 @@ def unlike_declared(pair: NDArray, rig: StereoRig, disc: Disc) -> tuple[Finding,
     return misplaced_dots(disc, disc.marker_centres_body + declared_places_kept(disc, shift[:, :2]))
 
 
-def _seen_dots(pair: NDArray, rig: StereoRig, disc: Disc) -> Iterator[tuple[Mask, Array, Array, Measured, float]]:
+def _seen_dots(pair: AnyArray, rig: StereoRig, disc: Disc) -> Iterator[tuple[Mask, Array, Array, Measured, float]]:
     """Dots identified by both cameras, from searches for blobs of several sizes that succeed.
 
     yields : which of the declared dots were found (m,), k of them; their positions (k, 3) [m] in the rig's world and

@@ -158,14 +158,8 @@ def doubts_of(
 
     seen : the dots, with the poses that were fitted to them
     """
-    misplaced = misplaced_dots(follower.disc, trajectory.disc.marker_centres_body)
-    found = [
-        *_lost(trajectory),
-        *_one_sided(trajectory),
-        *_symmetric(follower.disc),
-        *_clipped(follower),
-        *misplaced,
-    ]
+    found = [*_lost(trajectory), *_one_sided(trajectory), *_symmetric(follower.disc), *_clipped(follower)]
+    found += misplaced_dots(follower.disc, trajectory.disc.marker_centres_body)
     systematic_px = max(scatter.systematic_px)
     if scatter.whole > min(FAULTY * scatter.free, HOPELESS) and systematic_px > ORDINARY_PX:
         times = np.sqrt(scatter.whole / scatter.noise)

@@ -12,9 +12,8 @@ from math import comb
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import AnyArray, Array, Codes, Indices, Mask
 from disctrack.frames import rotation_from_vector, vector_from_rotation
 from disctrack.track.pose import PoseFits
 from disctrack.track.side_by_side import FEW, stretches
@@ -32,7 +31,7 @@ GREATEST_BLOW = 3.0  # [m/s] change of the disc's velocity between two frames: a
 MOST_STRUCK = 0.2  # largest fraction of a frame's dots rejected as outliers: beyond, the good ones are not known
 
 
-def unexpected_misfit(misfit: NDArray[np.floating], n_pixels: NDArray[np.floating]) -> Array:
+def unexpected_misfit(misfit: AnyArray, n_pixels: AnyArray) -> Array:
     """Factor (n, 2, m), at least 1, on the covariance of dots whose image is disturbed.
 
     misfit : (n, 2, m) reduced chi-square of the grey values about the template, NaN if there is no dot
@@ -122,7 +121,7 @@ def _at_fault_since_a_jump(residuals: Array, reduced: Array) -> Mask:
     return _unconnected(len(reduced), pieces, best, as_usual)
 
 
-def _unconnected(n: int, pieces: list[NDArray[np.intp]], best: int, fits: Callable[[int, int, int], bool]) -> Mask:
+def _unconnected(n: int, pieces: list[Indices], best: int, fits: Callable[[int, int, int], bool]) -> Mask:
     """(n,) True in the pieces of a recording that are not connected with the best one by a chain of fitting pieces.
 
     fits(left, right, kept) compares a piece with the nearest one accepted, `kept`, which is one of the two.
@@ -138,9 +137,7 @@ def _unconnected(n: int, pieces: list[NDArray[np.intp]], best: int, fits: Callab
     return apart
 
 
-def judge_poses(
-    fits: PoseFits, repeated: Mask, outlying: Mask, period: float, radius: float
-) -> tuple[PoseFits, NDArray[np.uint8]]:
+def judge_poses(fits: PoseFits, repeated: Mask, outlying: Mask, period: float, radius: float) -> tuple[PoseFits, Codes]:
     """Test every pose by its residuals and by the motion of its neighbours.
 
     fits : with their final covariances and chi-squares; repeated (n,): both images equal those of an earlier frame;
@@ -215,7 +212,7 @@ def differences(order: int, first: int) -> dict[int, float]:
     return {first + k: (-1.0) ** k * comb(order, k) for k in range(order + 1)}
 
 
-def sums_over_time(fits: PoseFits, weights: Mapping[int, float]) -> tuple[NDArray[np.intp], Array, Array]:
+def sums_over_time(fits: PoseFits, weights: Mapping[int, float]) -> tuple[Indices, Array, Array]:
     """Weighted sums of neighbouring poses as in `departure`.
 
     returns : frames (k,); sums (k, 6) in POSE_COMPONENTS; their covariance (k, 6, 6) by noise
@@ -250,7 +247,7 @@ def disconnected_frames(fits: PoseFits, period: float, radius: float) -> Mask:
     return _unconnected(len(fits.converged), pieces, longest, continues)
 
 
-def _broken(fits: PoseFits, last: NDArray[np.intp], first: NDArray[np.intp], period: float, radius: float) -> Mask:
+def _broken(fits: PoseFits, last: Indices, first: Indices, period: float, radius: float) -> Mask:
     """(k,) True if no possible motion leads from frames `last` (k,) to the later frames `first` (k,).
 
     Neither with the velocity before the gap nor with that after it; False if neither is known.

@@ -5,10 +5,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig, causes
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import AnyArray, Array, Codes, Mask
 from calibration.kit.brief import Brief
 from disctrack import frames
 from disctrack.findings import Finding
@@ -63,12 +62,13 @@ class Taken:
     pairs: range
     frame_rate: float  # [Hz]
     gravity: float = 9.81  # [m/s^2]
-    stamps: Array | None = None  # (n,) [s] written by the camera
+    stamps: Array | None = None  # [s] of all frames, written by the camera
 
     @property
     def time(self) -> Array:
         """(n,) [s]."""
-        return np.array(self.pairs) / self.frame_rate if self.stamps is None else np.asarray(self.stamps, float)
+        frames = np.array(self.pairs)
+        return frames / self.frame_rate if self.stamps is None else np.asarray(self.stamps[frames], float)
 
 
 def assemble(
@@ -127,7 +127,7 @@ def assemble(
 
 
 def _correct_dots(
-    seen: DotsInFrames, dots: NDArray, first: Follower, settings: TrackingSettings, taken: Taken
+    seen: DotsInFrames, dots: AnyArray, first: Follower, settings: TrackingSettings, taken: Taken
 ) -> tuple[tuple[float, float], tuple[Finding, ...]]:
     """Correct the dots for exposure, glare and lens field; returns the exposure [s] and findings about it.
 
@@ -179,17 +179,10 @@ def fit_all(seen: DotsInFrames, workers: int = 1, judged: bool = True) -> PoseFi
     def fitted(rows: slice) -> PoseFits:
         return fit_poses(seen.at(rows), reject_outliers=judged, with_sensitivity=judged)
 
-    n, one = len(seen.t), vars(fitted(slice(0, 1)))
-    whole = {name: np.empty((n, *value.shape[1:]), value.dtype) for name, value in one.items()}
-
-    def fill(rows: slice) -> None:
-        for name, value in vars(fitted(rows)).items():
-            whole[name][rows] = value
-
     # NumPy releases the GIL for large arrays: parts of some hundred frames run in parallel
     with ThreadPoolExecutor(workers, thread_name_prefix="part") as pool:
-        list(pool.map(fill, parts(n)))
-    return PoseFits(**whole)
+        found = [vars(fits) for fits in pool.map(fitted, parts(max(len(seen.t), 1)))]
+    return PoseFits(**{name: np.concatenate([part[name] for part in found]) for name in found[0]})
 
 
 def _shared_sigma(fits: PoseFits, systematic: Array, rig: StereoRig, moved: Array) -> list[list[object]]:
@@ -207,7 +200,7 @@ def _shared_sigma(fits: PoseFits, systematic: Array, rig: StereoRig, moved: Arra
     return [[float(value), cause] for value, cause in zip(sigma, most, strict=True)]
 
 
-def status_of(followed: NDArray[np.uint8], fits: PoseFits) -> NDArray[np.uint8]:
+def status_of(followed: Codes, fits: PoseFits) -> Codes:
     """(n,) status by the fits of frames in which the disc was followed; the others keep their status."""
     status, was = followed.copy(), followed == FrameStatus.MEASURED
     per_camera = fits.used.sum(axis=2)
@@ -222,8 +215,8 @@ def trajectory_of(
     seen: DotsInFrames,
     fits: PoseFits,
     systematic: Array,
-    status: NDArray[np.uint8],
-    located: NDArray[np.uint8],
+    status: Codes,
+    located: Codes,
     taken: Taken,
 ) -> Trajectory:
     """The trajectory of the fitted poses; rejected poses become NaN in the arrays of `fits`, too.

@@ -38,9 +38,8 @@ from itertools import product
 
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval2d
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array, Indices, Mask
 from disctrack.analyse.quantities import SIGMAS
 from disctrack.findings import Finding, Kind, Severity
 from disctrack.frames import CAMERAS
@@ -232,7 +231,7 @@ def shift_by_glare(pixels: Array, affine: Array, contrast: Array, radius: float,
     return shift
 
 
-def _apart(pixels: Array) -> NDArray[np.intp]:
+def _apart(pixels: Array) -> Indices:
     """Frames between which the dots move by a pixel: errors at rest repeat in all frames."""
     known = np.flatnonzero(np.isfinite(pixels).all(axis=(1, 2, 3)))
     places = pixels[known]

@@ -16,10 +16,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import INTRINSIC_PARAMETERS, N_RIG, PAIR_SHIFT
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Indices
 from disctrack.analyse.derivatives import CHANNELS
 from disctrack.track.judge.outlier_tests import differences, sums_over_time
 from disctrack.track.pose import DotsInFrames, PoseFits, whitening
@@ -57,7 +56,7 @@ def without_shared_faults(frames: DotsInFrames) -> AsBuilt | None:
     wide[:N_RIG] *= (np.diag(rig.covariance) > 0) & (np.arange(N_RIG) < PAIR_SHIFT.stop)
     shift, covariance, _, last = fit_shared(replace(frames.at(rows), further=by_delay[..., None]), wide)
     dots = slice(N_RIG, N_RIG + 2 * m)
-    _, fits = last.fitted(shift, reject=True)
+    _, fits = last.fitted(True, shift)
     spent = int(fits.degrees_of_freedom[fits.converged].sum())
     reduced = trimmed_reduced_chi_square(fits) * spent / max(spent - int(np.count_nonzero(wide)), 1)
     return AsBuilt.moved(rig, disc, shift[dots].reshape(m, 2), covariance[dots, dots], reduced)
@@ -154,7 +153,7 @@ def scatter_of_poses(fits: PoseFits) -> tuple[Array, Array, Array]:
     return found, sigma, factor
 
 
-def _precession(R: Array, rows: NDArray[np.intp]) -> Array:
+def _precession(R: Array, rows: Indices) -> Array:
     """Largest precession [rad per frame] in the seven frames around each of the rows."""
     axis = R[rows[:, None] + np.arange(-3, 4), :2, 2]
     tilt = np.linalg.norm(axis, axis=2)

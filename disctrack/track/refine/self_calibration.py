@@ -111,7 +111,7 @@ def fit_shared(
     variance = float(np.nanmedian(0.5 * np.trace(frames.covariance, axis1=-2, axis2=-1)))
     share = variance / (variance + len(frames.t) * repeats**2)  # at most (sigma / repeats)^2 effective frames
     for iteration in range(ITERATIONS):
-        frames, fits = frames.fitted(shift, reject=iteration > 0)
+        frames, fits = frames.fitted(iteration > 0, shift)
         ok = fits.converged
         reduced.append(float(fits.chi_square[ok].sum() / max(fits.degrees_of_freedom[ok].sum(), 1)))
         used = fits.used & ok[:, None, None]
@@ -218,8 +218,7 @@ def sized_by_pattern(rig: StereoRig, size: float, sigma: float) -> tuple[StereoR
 
 def _from_middle(disc: Disc) -> Array:
     """(m, 2) [m] positions of the dots relative to their mean."""
-    d: Array = disc.marker_centres_body[:, :2] - disc.marker_centres_body[:, :2].mean(axis=0)
-    return d
+    return np.asarray(disc.marker_centres_body[:, :2] - disc.marker_centres_body[:, :2].mean(axis=0))
 
 
 def declared_places_kept(disc: Disc, shift: Array) -> Array:

@@ -27,7 +27,7 @@ from disctrack.files.whole import whole_file, write_whole
 from disctrack.frames import COORDINATES
 from disctrack.trajectory import FrameStatus, Trajectory
 from disctrack.trajectory.exchange.rigs import array_of, camera_of, content_of, rotation_of
-from disctrack.trajectory.file import labelled
+from disctrack.trajectory.file import disc_sizes, labelled, recording_numbers
 
 _YAML = ("M1", "D1", "M2", "D2", "R", "T")
 _BESIDE = ("image_size1", "image_size2", "R_left_world", "t_left_world")
@@ -108,8 +108,7 @@ def write_mat(path: Path, trajectory: Trajectory) -> None:
     disctrack.q (n, 6) with disctrack.q_names, q_sigma (this frame's noise), q_sigma_calibration (common to all frames);
     disctrack.units holds the unit of every field. Raises OutputError.
     """
-    variables, _, numbers = labelled(trajectory)
-    disc = {name.removeprefix("disc_"): value for name, value in numbers.items() if name.startswith("disc_")}
+    variables = labelled(trajectory)
     content = {
         "time": trajectory.time,
         "q": trajectory.q,
@@ -118,8 +117,8 @@ def write_mat(path: Path, trajectory: Trajectory) -> None:
         "q_names": np.array(COORDINATES, dtype=object),
         **{name: np.asarray(item.data) for name, item in variables.items()},
         "status_names": np.array([status.name.lower() for status in FrameStatus], dtype=object),
-        **{name: value for name, value in numbers.items() if not name.startswith("disc_")},
-        "disc": {**disc, "marker_centres_body_m": trajectory.disc.marker_centres_body},
+        **recording_numbers(trajectory),
+        "disc": {**disc_sizes(trajectory.disc), "marker_centres_body_m": trajectory.disc.marker_centres_body},
         "units": {"time": "s", "q": "m, m, m, rad, rad, rad"} | {name: item.units for name, item in variables.items()},
     }
     _save(path, {"disctrack": content})

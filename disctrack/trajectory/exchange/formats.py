@@ -108,7 +108,7 @@ def convert(
     refuse_existing(path, overwrite)
     refuse_input(path)
     stated = {name: value for name, value in stated.items() if value}
-    if not _is_ours(paths[0]):
+    if not (paths[0].suffix in OWN or h5py.is_hdf5(paths[0])):
         value = read_foreign(paths, **stated)
     elif stated:
         raise OutputError(f"{_options(stated)}: says nothing about {paths[0]}, a file of ours; leave it out")
@@ -179,10 +179,6 @@ def _known(rows: Iterable[Format]) -> str:
 def _options(stated: Iterable[str]) -> str:
     names = {"world_is_table": "table", "unit": "unit-mm"}
     return ", ".join(f"--{names.get(word, word).replace('_', '-')}" for word in stated)
-
-
-def _is_ours(path: Path) -> bool:
-    return path.suffix in OWN or h5py.is_hdf5(path)
 
 
 def _own(paths: Sequence[Path]) -> Trajectory | StereoRig:

@@ -28,6 +28,7 @@ from disctrack.errors import OutputError, RigFileError, told_as
 from disctrack.files.inputs import read_regular
 from disctrack.files.toml_tree import MOST, toml_value
 from disctrack.files.whole import write_whole
+from disctrack.frames import rotation_from_vector, vector_from_rotation
 
 Table = Mapping[str, Any]
 BROWN = ("k1", "k2", "p1", "p2", "k3")
@@ -70,7 +71,8 @@ def array_of(table: Table, key: str, shape: tuple[int, ...], where: str) -> Arra
 
 def rotation_of(rotation: Array, where: str) -> Array:
     """(3, 3) from a matrix or a rotation vector. Raises RigFileError, whose message begins with `where`."""
-    R = np.asarray(cv2.Rodrigues(rotation.reshape(3))[0] if rotation.size == 3 else rotation, float)
+    with np.errstate(all="ignore"):  # numbers in a file could overflow; they give no rotation
+        R = rotation_from_vector(rotation.reshape(3)) if rotation.size == 3 else rotation
     whole = R.size == 9 and np.abs(R).max() < 2  # larger numbers in a file could overflow
     R = R.reshape(3, 3) if whole else np.zeros((3, 3))
     if not np.abs(R @ R.T - np.eye(3)).max() < 1e-6 or np.linalg.det(R) < 0:
@@ -111,7 +113,7 @@ def _write_toml(path: Path, rig: StereoRig, tables: Mapping[str, Table], terms: 
     text = ""
     for (name, own), camera, (R, t) in zip(tables.items(), rig.cameras, rig.camera_poses(), strict=True):
         table = {"size": camera.image_size, "matrix": camera.camera_matrix, "distortions": camera.distortion[:terms]}
-        table |= {"translation": t, "rotation": _rotation_vector(R), "fisheye": False}
+        table |= {"translation": t, "rotation": vector_from_rotation(R), "fisheye": False}
         text += f"[{name}]\n{_lines('{} = {}', {**own, **table})}\n"
     write_whole(path, (text + end).encode())
 
@@ -209,7 +211,7 @@ def write_mrcal(path: Path, rig: StereoRig) -> None:
             "    # fx, fy, cx, cy, k1, k2, p1, p2, k3\n"
             f"    'intrinsics': {toml_value(camera.parameters)},\n"
             "    # rotation vector and translation [m]: reference to camera\n"
-            f"    'extrinsics': {toml_value(np.concatenate([_rotation_vector(R), t]))},\n"
+            f"    'extrinsics': {toml_value(np.concatenate([vector_from_rotation(R), t]))},\n"
             f"    'imagersize': {toml_value(camera.image_size)}\n"
             "}\n"
         )
@@ -285,10 +287,6 @@ def read_dlt(
 
 def _matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-
-
-def _rotation_vector(R: Array) -> Array:
-    return np.asarray(cv2.Rodrigues(R)[0], float).ravel()
 
 
 # --- Approximation of a lens field, or of coefficients that a format lacks, by Brown's coefficients that it stores ----
