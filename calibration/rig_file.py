@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.board.target import described
 from calibration.cameras.camera import (
@@ -27,6 +26,7 @@ from calibration.cameras.camera import (
 )
 from calibration.cameras.splines import LensField
 from calibration.kit.arguments import checked
+from calibration.kit.arrays import AnyArray
 from calibration.kit.errors import RigFileError
 from calibration.kit.seal import check_seal, sealed
 from calibration.stereo import StereoCalibration
@@ -321,7 +321,7 @@ def complete_file(
         ) from error
 
 
-def _get(group: h5py.Group, name: str, row: Dataset, sizes: Mapping[str, int] | None = None) -> NDArray:
+def _get(group: h5py.Group, name: str, row: Dataset, sizes: Mapping[str, int] | None = None) -> AnyArray:
     """A dataset, read after a check of its shape and kind against excessive sizes; unknown sizes are free."""
     if name not in group:
         raise RigFileError(f"{group.name}/{name} is missing; present: {', '.join(group)}")
@@ -345,7 +345,7 @@ def read_rig_group(group: h5py.Group) -> StereoRig:
     )
 
 
-def read_beside_cameras(group: h5py.Group, of_cameras: Iterable[Sequence[NDArray]]) -> StereoRig:
+def read_beside_cameras(group: h5py.Group, of_cameras: Iterable[Sequence[AnyArray]]) -> StereoRig:
     """A rig from a group with the datasets of `beside_cameras`; of_cameras : parameters and image size of each.
 
     Raises RigFileError if the content is not a rig.

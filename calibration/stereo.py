@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from calibration.board.chessboard import BoardNotFound, CornerView, negatives
 from calibration.board.search import Progress, located
@@ -21,7 +21,7 @@ from calibration.judge.assessment import Assessment, assess, stereo_covariance
 from calibration.judge.pairs import PairMotion, camera_moved, compared, judge_pairs, motion_between_exposures, zoomed
 from calibration.judge.tolerances import BoardTolerances, board_shape, rig_with_covariance, with_tolerances
 from calibration.kit.arguments import Thickness, checked
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import AnyArray, Array
 from calibration.kit.brief import Brief
 from calibration.kit.errors import CalibrationError, told_as
 from calibration.kit.stuck_pixels import repaired_views
@@ -118,8 +118,8 @@ class StereoCalibration(Brief):
 @one_blas_thread
 @checked
 def calibrate_stereo(
-    left_images: Sequence[NDArray],
-    right_images: Sequence[NDArray],
+    left_images: Sequence[AnyArray],
+    right_images: Sequence[AnyArray],
     board: Target,
     tolerances: BoardTolerances | None = None,
     table_view: int | None = None,
@@ -154,7 +154,7 @@ def calibrate_stereo(
     return replace(found, doubts=(negative,) if negative else (), warnings=(*notes, *found.warnings))
 
 
-def check_sizes(left: Sequence[NDArray], right: Sequence[NDArray], names: Sequence[tuple[str, str]]) -> None:
+def check_sizes(left: Sequence[AnyArray], right: Sequence[AnyArray], names: Sequence[tuple[str, str]]) -> None:
     """Raises CalibrationError if the images of a camera are of different sizes."""
     for camera, images in enumerate((left, right)):
         for i, image in enumerate(images):
@@ -416,7 +416,7 @@ def _listed(images: Iterable[Image]) -> str:
 
 
 def _observations(views: Views) -> Observations:
-    parts: list[tuple[NDArray, ...]] = []
+    parts: list[tuple[AnyArray, ...]] = []
     for camera, side in enumerate(views):
         for v, view in enumerate(side):
             if isinstance(view, CornerView):

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from calibration.board.chessboard import BoardNotFound, as_8_bit, luminance, reduced
 from calibration.board.corner_fit import CornerView, fit_view, smooth_grid
 from calibration.board.target import LEAST_POINTS, CharucoBoard
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import AnyArray, Array, Indices
 from calibration.kit.errors import CalibrationError
 
 
-def find_charuco(image: NDArray, board: CharucoBoard) -> CornerView | BoardNotFound:
+def find_charuco(image: AnyArray, board: CharucoBoard) -> CornerView | BoardNotFound:
     """Locate the inner corners of a ChArUco board; corners out of view are not accepted, with an empty reason.
 
     image : (h, w) or (h, w, 3) as OpenCV reads it; see `chessboard.luminance`
@@ -47,14 +47,14 @@ def find_charuco(image: NDArray, board: CharucoBoard) -> CornerView | BoardNotFo
     return replace(view, notes=notes)
 
 
-def _detected(grey: NDArray[np.uint8], board: CharucoBoard) -> tuple[Array, NDArray[np.intp]]:
+def _detected(grey: NDArray[np.uint8], board: CharucoBoard) -> tuple[Array, Indices]:
     """Rough corners (k, 2) [px] and their numbers in the order of `CharucoBoard.points`."""
     number = getattr(cv2.aruco, board.dictionary, None)
     if number is None or not board.dictionary.startswith("DICT_"):
         known = ", ".join(name for name in dir(cv2.aruco) if name.startswith("DICT_") and "_50" in name)
         raise CalibrationError(f"dictionary {board.dictionary!r} is not one of OpenCV's: {known}, ...")
     grey, scale = reduced(grey)
-    best: tuple[Array, NDArray[np.intp]] = (np.zeros((0, 2)), np.zeros(0, np.intp))
+    best: tuple[Array, Indices] = (np.zeros((0, 2)), np.zeros(0, np.intp))
     # boards with an even number of rows began with a light square before OpenCV 4.6; such prints exist
     for legacy in (False, True) if board.squares[1] % 2 == 0 else (False,):
         pattern = cv2.aruco.CharucoBoard(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from calibration.board.corner_fit import CornerView, fit_view, grey_at, local_axes, squares_round
 from calibration.board.target import Board, board_orders
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import AnyArray, Array
 from calibration.kit.errors import ArgumentError
 from calibration.kit.grey_levels import level_step
 
@@ -32,7 +32,7 @@ class BoardNotFound:
     reason: str
 
 
-def luminance(image: NDArray) -> tuple[NDArray, tuple[str, ...]]:
+def luminance(image: AnyArray) -> tuple[AnyArray, tuple[str, ...]]:
     """Grey values (h, w) of an image as cv2.IMREAD_UNCHANGED returns it, and a note if information was discarded.
 
     Grey images, 8 or 16 bit, are divided by the common factor of their values. Three equal channels are one grey image.
@@ -51,7 +51,7 @@ def luminance(image: NDArray) -> tuple[NDArray, tuple[str, ...]]:
 
 
 @checked
-def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool = True) -> CornerView | BoardNotFound:
+def find_corners(image: AnyArray, inner_corners: tuple[int, int], thorough: bool = True) -> CornerView | BoardNotFound:
     """Locate the inner corners of a chessboard.
 
     image : (h, w) or (h, w, 3) uint8 or uint16, blue-green-red order as OpenCV reads it; see `luminance`
@@ -70,7 +70,7 @@ def find_corners(image: NDArray, inner_corners: tuple[int, int], thorough: bool 
     return view if isinstance(view, BoardNotFound) else replace(view, notes=notes)
 
 
-def board_in(grey: NDArray, thorough: bool = False) -> tuple[int, int] | None:
+def board_in(grey: AnyArray, thorough: bool = False) -> tuple[int, int] | None:
     """Inner corners (long side, short side) of the whole chessboard, of any size, in an image of grey values.
 
     thorough : OpenCV's exhaustive search, 0.3 s for 1280 x 720; without it, often only a part of a board is found
@@ -104,7 +104,7 @@ def _view_at(start: Array, values: Array, inner_corners: tuple[int, int]) -> Cor
     return BoardNotFound(beyond) if beyond else view
 
 
-def as_8_bit(grey: NDArray) -> NDArray[np.uint8]:
+def as_8_bit(grey: AnyArray) -> NDArray[np.uint8]:
     """Grey values stretched to 8 bit, for the rough search only."""
     if grey.dtype == np.uint8:
         return grey
@@ -114,7 +114,7 @@ def as_8_bit(grey: NDArray) -> NDArray[np.uint8]:
     return np.clip((grey - low) * (255.0 / max(high - low, 1e-12)), 0, 255).astype(np.uint8)
 
 
-def reduced(grey: NDArray, largest: int = SEARCH_SIZE) -> tuple[NDArray, float]:
+def reduced(grey: AnyArray, largest: int = SEARCH_SIZE) -> tuple[AnyArray, float]:
     """The image, scaled down if its longer side exceeds `largest` [px], and the scale."""
     scale = min(1.0, largest / max(grey.shape))
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else grey
@@ -142,7 +142,7 @@ def _rough_corners(grey: NDArray[np.uint8], inner_corners: tuple[int, int], thor
     return None
 
 
-def _even(grid: NDArray) -> bool:
+def _even(grid: AnyArray) -> bool:
     """Whether the grid of corners (rows, columns, 2) has no skipped line."""
     for along in (grid, grid.swapaxes(0, 1)):
         step = np.median(np.linalg.norm(np.diff(along, axis=0), axis=-1), axis=1)
@@ -228,7 +228,7 @@ def _saddles(grey: Array, points: Array, axes: Array, aside: float = 0.3) -> Arr
     return np.where(lighter > 0, lighter, -np.maximum(darker, 0.0))
 
 
-def negatives(images: Sequence[NDArray], views: Sequence[CornerView | BoardNotFound], board: Board) -> str:
+def negatives(images: Sequence[AnyArray], views: Sequence[CornerView | BoardNotFound], board: Board) -> str:
     """Reason for which images of a chessboard appear to be negatives, in words; "" if there is none.
 
     The pattern itself gives no evidence: the colouring of a negative is that of the board turned by 180 deg.
@@ -246,7 +246,7 @@ def negatives(images: Sequence[NDArray], views: Sequence[CornerView | BoardNotFo
     )
 
 
-def margin_is_dark(image: NDArray, view: CornerView, inner_corners: tuple[int, int]) -> bool:
+def margin_is_dark(image: AnyArray, view: CornerView, inner_corners: tuple[int, int]) -> bool:
     """Whether the paper just outside a chessboard's squares is as dark as the dark squares.
 
     False if too little of it is in view.

@@ -16,11 +16,10 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from calibration.board._corner_kernel import N_CORNER, fit_corners
 from calibration.board.target import LEAST_POINTS
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import AnyArray, Array, Indices, Mask
 
 LEAST_SIGMA = 0.05  # px, least standard deviation of a corner that no model fits
 MAX_WINDOW = 0.85  # of a square: excludes the blurred neighbouring edge
@@ -50,7 +49,7 @@ class CornerView:
     reasons: tuple[str, ...]  # (n,) why a corner was rejected; "" if it is accepted or out of view
     notes: tuple[str, ...] = ()
 
-    def reordered(self, order: NDArray[np.intp]) -> CornerView:
+    def reordered(self, order: Indices) -> CornerView:
         """The same view with corner order[i] at index i, for boards whose colouring allows several orders."""
         arrays = {name: getattr(self, name)[order] for name in ("points", "covariance", "accepted")}
         return replace(self, reasons=tuple(self.reasons[i] for i in order), **arrays)
@@ -298,7 +297,7 @@ def squares_round(grey: Array, points: Array, axes: Array, aside: float) -> Arra
     return grey_at(grey, points[:, None] + aside * signs @ axes).reshape(-1, 2, 2)
 
 
-def grey_at(image: NDArray, places: Array) -> Array:
+def grey_at(image: AnyArray, places: Array) -> Array:
     """Grey values (...), averaged over the channels, of the pixels at places (..., 2); NaN out of view."""
     inside = np.all((places >= 0) & (places <= np.array(image.shape[1::-1]) - 1), axis=-1)
     x, y = np.moveaxis(np.rint(np.where(inside[..., None], places, 0.0)).astype(int), -1, 0)

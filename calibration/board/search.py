@@ -4,8 +4,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from numpy.typing import NDArray
-
 from calibration.board.charuco import find_charuco
 from calibration.board.chessboard import (
     SEARCH_SIZE,
@@ -17,7 +15,7 @@ from calibration.board.chessboard import (
     reduced,
 )
 from calibration.board.target import Board, Target
-from calibration.kit.arrays import evenly
+from calibration.kit.arrays import AnyArray, evenly
 
 Progress = Callable[[str, int, int], None]
 LEAST_VIEWS = 2  # with the whole board, for its size to be believed
@@ -26,7 +24,7 @@ VIEWS_TRIED = 8  # sample of a set of images; if it shows no board, the slow sea
 
 
 def located(
-    images: Sequence[NDArray], target: Target, progress: Progress | None = None
+    images: Sequence[AnyArray], target: Target, progress: Progress | None = None
 ) -> list[CornerView | BoardNotFound]:
     """The target in every image.
 
@@ -65,7 +63,7 @@ def located(
     return [views[index] for index in range(len(images))]
 
 
-def other_board(images: Sequence[NDArray], refused: Sequence[bool], target: Target) -> str:
+def other_board(images: Sequence[AnyArray], refused: Sequence[bool], target: Target) -> str:
     """The chessboard that most images show instead of the declared one, in words; "" if there is none.
 
     refused : whether the declared one was not found in an image; if it was, its rim may be mistaken for a line
@@ -82,7 +80,7 @@ def other_board(images: Sequence[NDArray], refused: Sequence[bool], target: Targ
     return f"{seen} of {len(images)} images looked at show {size[0]} x {size[1]}: inner_corners = {list(size)}"
 
 
-def board_size(images: Sequence[NDArray], largest: int = SEARCH_SIZE) -> tuple[tuple[int, int] | None, int]:
+def board_size(images: Sequence[AnyArray], largest: int = SEARCH_SIZE) -> tuple[tuple[int, int] | None, int]:
     """Inner corners (long side, short side) of the board in most images, or None; and the number of these images.
 
     largest : [px] to which images are reduced: OpenCV's search takes 0.3 s at 800 x 600, 5.5 s at 4000 x 3000
@@ -101,7 +99,7 @@ def board_size(images: Sequence[NDArray], largest: int = SEARCH_SIZE) -> tuple[t
     return (best, seen[best]) if best and seen[best] >= min(LEAST_VIEWS, len(images)) else (None, 0)
 
 
-def _found(size: tuple[int, int], greys: Sequence[NDArray], sizes: Sequence[tuple[int, int] | None]) -> int:
+def _found(size: tuple[int, int], greys: Sequence[AnyArray], sizes: Sequence[tuple[int, int] | None]) -> int:
     """Number of images with another size, or none, in which a search for this size succeeds."""
     others = [grey for grey, found in zip(greys, sizes, strict=True) if found != size]
     return sum(not isinstance(find_corners(grey, size), BoardNotFound) for grey in others)

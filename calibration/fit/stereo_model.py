@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, StereoRig, by_turning, rotation_from_vector
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import AnyArray, Array, Indices, Mask
 from calibration.kit.errors import ArgumentError
 
 N_STEREO = PAIR_SHIFT.stop  # left and right intrinsics, rotation and translation of the pair come first
@@ -20,9 +19,9 @@ N_STEREO = PAIR_SHIFT.stop  # left and right intrinsics, rotation and translatio
 class Observations:
     """Image points of target points of all views and cameras, in flat arrays."""
 
-    view: NDArray[np.intp]  # (m,) 0..n_views-1
-    camera: NDArray[np.intp]  # (m,) 0 left, 1 right
-    point: NDArray[np.intp]  # (m,) index into the target's points
+    view: Indices  # (m,) 0..n_views-1
+    camera: Indices  # (m,) 0 left, 1 right
+    point: Indices  # (m,) index into the target's points
     pixels: Array  # (m, 2) [px]
     covariance: Array  # (m, 2, 2) [px^2]
 
@@ -37,7 +36,7 @@ class Observations:
     def __len__(self) -> int:
         return len(self.view)
 
-    def __getitem__(self, keep: NDArray) -> Observations:
+    def __getitem__(self, keep: AnyArray) -> Observations:
         return Observations(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 

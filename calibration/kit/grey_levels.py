@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calibration.kit.arrays import AnyArray
+
 # Number of different values below which they may share a factor by chance.
 _ENOUGH_LEVELS = 16
 # Ratio of the number of pixels at the saturation level to that at any of the levels just below.
@@ -18,7 +20,7 @@ _PILE, _PILE_PIXELS = 8, 30
 _MOSAIC = 0.02
 
 
-def level_step(image: NDArray) -> int:
+def level_step(image: AnyArray) -> int:
     """Greatest common divisor of the grey values of an image; 1 for 8-bit images and for those with few levels."""
     if image.dtype != np.uint16:
         return 1
@@ -27,7 +29,7 @@ def level_step(image: NDArray) -> int:
     return int(np.gcd.reduce(values)) if len(values) >= _ENOUGH_LEVELS else 1
 
 
-def full_scale(image: NDArray) -> int:
+def full_scale(image: AnyArray) -> int:
     """Largest grey value of the camera, with the fewest bits, but at least 8, that the image needs."""
     if image.dtype == np.uint8:
         return 255
@@ -36,7 +38,7 @@ def full_scale(image: NDArray) -> int:
     return step * (2**bits - 1)
 
 
-def _counts(images: NDArray) -> NDArray[np.int64]:
+def _counts(images: AnyArray) -> NDArray[np.int64]:
     """Number of pixels with each grey value, up to the largest."""
     bins = int(images.max()) + 1 if images.size else 1  # cv2 is ten times as fast as bincount, and counts in singles
     counts = np.zeros(bins, np.int64)
@@ -45,7 +47,7 @@ def _counts(images: NDArray) -> NDArray[np.int64]:
     return counts
 
 
-def saturation_level(images: NDArray) -> int | None:
+def saturation_level(images: AnyArray) -> int | None:
     """Grey value at which pixels saturate: the largest, if it is full scale or has far more pixels than those below.
 
     images : any shape, uint8 or uint16; better detected in several images of a recording. None if it is not detected:
@@ -60,7 +62,7 @@ def saturation_level(images: NDArray) -> int | None:
     return int(levels[-1]) if found else None
 
 
-def mosaic_gains(images: NDArray) -> NDArray | None:
+def mosaic_gains(images: AnyArray) -> AnyArray | None:
     """(2, 2) gains, with mean 1, of pixels in even and odd rows and columns, if they indicate a colour filter.
 
     images : (n, height, width) of a grey scene, uint8 or uint16. The gains are medians over the lighter half of each

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kit.arrays import Mask
+from calibration.kit.arrays import AnyArray, Mask
 
 OFF = 0.12  # of the images' range: least difference of a pixel from the median of its neighbours
 STEADY = 0.04  # of the range: largest change of a stuck pixel over the images
@@ -21,7 +21,7 @@ PASSED = 0.3  # of the range: least change of the surroundings, by squares, or b
 OFTEN = 0.3  # of the views: least fraction in which such a pixel differs from its neighbours
 
 
-def stuck_pixels(images: Sequence[NDArray] | NDArray, of_board: bool = False) -> Mask | None:
+def stuck_pixels(images: Sequence[AnyArray] | AnyArray, of_board: bool = False) -> Mask | None:
     """True for stuck pixels of images (height, width) or (height, width, channels).
 
     They are constant and differ from their neighbours in all images. In views of a board, squares are as dark as a
@@ -43,12 +43,12 @@ def stuck_pixels(images: Sequence[NDArray] | NDArray, of_board: bool = False) ->
     return found if 0 < found.sum() <= MOST * found.size else None
 
 
-def _changed(images: Sequence[NDArray] | NDArray) -> NDArray[np.int32]:
+def _changed(images: Sequence[AnyArray] | AnyArray) -> NDArray[np.int32]:
     """Range of each pixel's values over the images."""
     return reduce(np.maximum, images).astype(np.int32) - reduce(np.minimum, images)
 
 
-def repaired_views(views: Sequence[NDArray], camera: str) -> tuple[list[NDArray], str]:
+def repaired_views(views: Sequence[AnyArray], camera: str) -> tuple[list[AnyArray], str]:
     """Copies of one camera's views of a board with stuck pixels replaced, and a warning ("": none).
 
     views : grey (height, width) or colour (height, width, channels), of one size and type; channels are independent.
@@ -68,7 +68,7 @@ def repaired_views(views: Sequence[NDArray], camera: str) -> tuple[list[NDArray]
     return mended, f"{camera} camera: {n} pixels show one value in all views; their neighbours stand in for them"
 
 
-def repair(images: NDArray, stuck: Mask) -> None:
+def repair(images: AnyArray, stuck: Mask) -> None:
     """Replace, in place, the stuck pixels of images (..., height, width) by the median of their good neighbours."""
     y, x = np.nonzero(stuck)
     steps = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])

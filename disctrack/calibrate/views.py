@@ -4,12 +4,11 @@ import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from numpy.typing import NDArray
-
 from calibration import BoardTolerances, StereoCalibration, calibrate_stereo
 from calibration.board.search import Progress
 from calibration.board.target import Target
 from calibration.kit.arguments import Thickness, checked
+from calibration.kit.arrays import AnyArray
 from calibration.kit.brief import Brief
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
@@ -156,7 +155,7 @@ def calibrate_views(
             f"{views.place}: [table] view = {table_view}, but there are {len(views)} calibration views, "
             "counted from 0. Name the view whose board lies flat on the table."
         )
-    read: dict[int, tuple[NDArray, ...]] = {}
+    read: dict[int, tuple[AnyArray, ...]] = {}
     problems = []
     for i, pair in enumerate(zip(views.left, views.right, strict=True)):
         try:
@@ -172,14 +171,14 @@ def calibrate_views(
     return found, tuple(problems)
 
 
-def pixels_of(view: View) -> NDArray:
+def pixels_of(view: View) -> AnyArray:
     """Grey values or colours of a view as stored. Raises RecordingError."""
     if isinstance(view, FrameView):
         return view.reader.read(view.index)
     return decode(content_of(view, str(view)), str(view))
 
 
-def _pixels(view: View, flat: FlatField | None, part: Part | None) -> NDArray:
+def _pixels(view: View, flat: FlatField | None, part: Part | None) -> AnyArray:
     """Corrected grey values or colours of a view. Raises RecordingError, which names the file or frame."""
     image = pixels_of(view)
     whole = flat.corrected(image) if flat is not None and flat.fits(image) else image

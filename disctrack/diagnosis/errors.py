@@ -4,9 +4,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import trapezoid
 
+from calibration.kit.arrays import Indices
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import state_of
 from disctrack.diagnosis.stretch import MIN_FRAMES
@@ -178,12 +178,12 @@ def valid_ranges(system: DiscSystem, judged: System, base: Fit, noise: float) ->
     frames = np.flatnonzero(system.weights > 0)
     theta = np.degrees(system.trajectory.q[system.rows, 4])
 
-    def holds(rows: NDArray[np.intp]) -> bool:
+    def holds(rows: Indices) -> bool:
         trial = fit(subset(judged, np.isin(np.arange(len(system.time)), rows)), base.quantities, base.values, 10)
         limit = noise * (1.0 + 4.0 * np.sqrt(2.0 / max(trial.degrees_of_freedom, 1)))  # four sigmas of chi-square
         return bool(trial.converged and trial.reduced_chi_square <= limit)
 
-    def longest(part: Callable[[int], NDArray[np.intp]], at: int) -> ValidRange | None:
+    def longest(part: Callable[[int], Indices], at: int) -> ValidRange | None:
         low, high = max(len(frames) // 5, MIN_FRAMES), len(frames)
         if low >= high or not holds(part(low)):
             return None

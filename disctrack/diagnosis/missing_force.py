@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Indices
 from calibration.kit.least_squares import triangle
 from disctrack.diagnosis.law_library import SHAPES, Family, LearnedLaw, families
 from disctrack.diagnosis.motion import STATE_SCALES, THETA_END, state_of
@@ -37,7 +36,7 @@ INSTANTS_PER_SECOND = 1000.0  # of the responses: Simpson's rule errs by 0.4 % a
 CHUNK = 120  # families of the library that are evaluated at a time
 
 
-Response = tuple[Motion, Array, NDArray[np.intp]]  # a motion, its Green's function, indices of the frames' instants
+Response = tuple[Motion, Array, Indices]  # a motion, its Green's function, indices of the frames' instants
 
 
 @dataclass(frozen=True)

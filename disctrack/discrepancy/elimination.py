@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Indices
 from calibration.kit.least_squares import OwnNumbers, eliminate, triangle
 from disctrack.discrepancy.system import Quantity, System, Values
 
@@ -92,7 +91,7 @@ def projection(system: System, quantities: Sequence[Quantity], values: Values) -
 class Block:
     """Rows with quantities of their own."""
 
-    rows: NDArray[np.intp]
+    rows: Indices
     columns: list[int]  # slots
     quantities: tuple[Quantity, ...]
 

@@ -20,7 +20,7 @@ from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.stats import norm
 
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array, Indices, Mask
 from disctrack.discrepancy.elimination import Own, is_linear, projection
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.significance import SURE
@@ -34,7 +34,7 @@ OUTLIER = 8.0  # standard deviations
 THIRD = 2.31  # samples per independent one among third differences: 1 + 2 (15^2 + 6^2 + 1) / 20^2
 
 
-def third_differences(system: System, numbers: Array) -> tuple[Array, NDArray[np.intp]]:
+def third_differences(system: System, numbers: Array) -> tuple[Array, Indices]:
     """Third differences in time of (n, w) wherever four samples are consecutive, (k, w), and their rows (k,).
 
     They pass white noise (variance 20) and suppress what changes slowly from sample to sample.

@@ -10,9 +10,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Indices, Mask
 from disctrack.frames import rotation_from_quaternion
 from disctrack.trajectory import Trajectory
 
@@ -54,7 +53,7 @@ def clock_jumps(trajectory: Trajectory) -> dict[int, int]:
     return dict(sorted(jumps.items()))
 
 
-def _cuts(seen: NDArray[np.bool_]) -> Iterator[tuple[int, NDArray[np.intp]]]:
+def _cuts(seen: Mask) -> Iterator[tuple[int, Indices]]:
     """Numbers of frames without a pose at a cut, and the rows that follow SIDE poses and precede such a cut."""
     for gap in range(min(MOST_LOST, len(seen) - 2 * SIDE) + 1):
         around = np.lib.stride_tricks.sliding_window_view(seen, 2 * SIDE + gap)

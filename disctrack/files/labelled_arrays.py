@@ -9,7 +9,9 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from calibration.kit.arrays import AnyArray
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ def _create(group: h5py.Group, name: str, variable: Variable) -> h5py.Dataset:
 MOST_COMPRESSION = 1100
 
 
-def read_array(dataset: h5py.Dataset) -> NDArray:
+def read_array(dataset: h5py.Dataset) -> AnyArray:
     """Values of a dataset, text as str. Raises ValueError if its stated size is larger than the file can hold."""
     if dataset.size * dataset.dtype.itemsize > MOST_COMPRESSION * dataset.file.id.get_filesize():
         raise ValueError(f"{dataset.name} claims {dataset.shape} values, more than the file can hold")

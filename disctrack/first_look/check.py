@@ -10,10 +10,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration import StereoCalibration, StereoRig
-from calibration.kit.arrays import evenly
+from calibration.kit.arrays import AnyArray, evenly
 from calibration.rig_file import record_of
 from disctrack.analyse.declaration import Boards, across, contradictions, lost_pairs, turned_board, with_square
 from disctrack.calibrate.stage import boards_in, boards_of, given_rig, noticed_in, source_of
@@ -43,8 +42,8 @@ class Check:
     findings: list[Finding] = field(default_factory=list)
     calibration: StereoCalibration | None = None
     boards: Boards | None = None
-    shown: list[tuple[Trajectory, int, NDArray]] = field(default_factory=list)  # trajectory, row, images (2, h, w)
-    raw: list[NDArray] = field(default_factory=list)  # image pairs in which the disc was not found
+    shown: list[tuple[Trajectory, int, AnyArray]] = field(default_factory=list)  # trajectory, row, images (2, h, w)
+    raw: list[AnyArray] = field(default_factory=list)  # image pairs in which the disc was not found
     not_read: NotRead = field(default_factory=dict)
 
     def add(self, kind: Kind, text: str, advice: str = "", severity: Severity = Severity.REFUSAL) -> None:
@@ -52,7 +51,7 @@ class Check:
         remedies = (Remedy(action=advice),) if advice else ()
         self.findings.append(Finding(kind, severity, text, Subject("check"), remedies=remedies))
 
-    def images(self, pairs: ImagePairs, frames: Iterable[int]) -> list[NDArray]:
+    def images(self, pairs: ImagePairs, frames: Iterable[int]) -> list[AnyArray]:
         """(2, h, w) images of these frames; unreadable ones are skipped, and recorded in `not_read`."""
         blocks = (block for i in frames for block in pairs.reading(self.not_read)(i, i + 1))
         return [block.images[0].copy() for block in blocks if not block.unreadable]

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from calibration import StereoCalibration
 from calibration.board.chessboard import luminance
+from calibration.kit.arrays import AnyArray
 from disctrack.first_look.check import Check
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.decoding import decode
@@ -42,12 +42,12 @@ def check_figure(seen: Check) -> Figure | None:
     return figure
 
 
-def _beside(images: Iterable[NDArray]) -> NDArray:
+def _beside(images: Iterable[AnyArray]) -> AnyArray:
     """The images side by side, each up to its own brightest pixel: a dim one is seen as well."""
     return np.hstack([image / np.float32(max(image.max(), 1)) for image in images])
 
 
-def _table_view(found: StereoCalibration) -> list[NDArray]:
+def _table_view(found: StereoCalibration) -> list[AnyArray]:
     """Its images, left and right; none without such a view, or where they are not files."""
     names = () if found.table_view is None else found.view_names[found.table_view]
     images = (luminance(decode(Path(name).read_bytes(), name))[0] for name in names)

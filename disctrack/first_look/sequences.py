@@ -9,10 +9,9 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.board.search import VIEWS_TRIED, board_size
-from calibration.kit.arrays import evenly
+from calibration.kit.arrays import AnyArray, evenly
 from disctrack.calibrate.views import pixels_of, views_of
 from disctrack.errors import RecordingError
 from disctrack.recording.readers import open_frames
@@ -43,7 +42,7 @@ class Sequence:
         """Reader of its frames. Raises RecordingError."""
         return open_frames(self.pattern, self.folder, camera)
 
-    def some_images(self) -> list[NDArray]:
+    def some_images(self) -> list[AnyArray]:
         """A few images, evenly distributed; views may be in colour. Raises RecordingError."""
         views = views_of(self.pattern, self.folder, "left", most=np.inf)
         return [pixels_of(views[i]) for i in evenly(len(views), VIEWS_TRIED)]

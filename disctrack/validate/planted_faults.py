@@ -20,9 +20,8 @@ from warnings import catch_warnings
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import AnyArray, Array
 from calibration.rig_file import read_rig, write_rig
 from disctrack.errors import DiscTrackError
 from disctrack.faults.catalogue import FAULTS, HEIGHT, MOVED, TYPICAL_STEPS, Fault, each_of
@@ -211,14 +210,14 @@ def declare(folder: Path, tree: Tree) -> None:
     (folder / "recording.toml").write_text("".join(lines), encoding="utf-8")
 
 
-def redrawn(files: list[bytes], change: Callable[[NDArray, float], NDArray]) -> Iterator[NDArray]:
+def redrawn(files: list[bytes], change: Callable[[AnyArray, float], AnyArray]) -> Iterator[AnyArray]:
     """Changed images; the second argument of `change` is the share of the recording before the image."""
     for number, file in enumerate(files):
         image = np.asarray(cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED))
         yield change(image, number / len(files))
 
 
-def _files(**orders: Callable[..., Iterable[bytes | NDArray]]) -> Change:
+def _files(**orders: Callable[..., Iterable[bytes | AnyArray]]) -> Change:
     """Change of the files of folders; orders : by folder, a function of the files and the size."""
 
     def change(folder: Path, tree: Tree, size: float) -> None:
@@ -228,7 +227,7 @@ def _files(**orders: Callable[..., Iterable[bytes | NDArray]]) -> Change:
     return change
 
 
-def _images(change: Callable[[float, NDArray, float], NDArray], *folders: str) -> Change:
+def _images(change: Callable[[float, AnyArray, float], AnyArray], *folders: str) -> Change:
     """Change of the images of folders; change : a function of the size, an image and the share before it."""
     return _files(**dict.fromkeys(folders, lambda files, size: redrawn(files, partial(change, size))))
 
@@ -263,19 +262,19 @@ def _exchanged(folder: Path, tree: Tree, size: float) -> None:
     tree["cameras"] |= dict(zip(CAMERAS, [tree["cameras"][camera] for camera in CAMERAS[::-1]], strict=True))
 
 
-def _shifted(most: float, image: NDArray, share: float) -> NDArray:
+def _shifted(most: float, image: AnyArray, share: float) -> AnyArray:
     """Shift an image along x and y by this share of `most` [px]."""
     move, size = np.eye(2, 3), image.shape[::-1]
     move[:, 2] = share * most
     return cv2.warpAffine(image, move, size, flags=cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _knocked(most: float, image: NDArray, share: float) -> NDArray:
+def _knocked(most: float, image: AnyArray, share: float) -> AnyArray:
     """Shift the second half of the images."""
     return _shifted(most, image, round(share))
 
 
-def _with_glare(size: float, image: NDArray, share: float) -> NDArray:
+def _with_glare(size: float, image: AnyArray, share: float) -> AnyArray:
     """Add the reflection of a lamp with a maximum of `size` grey values of 8 bits."""
     height, width = image.shape
     y, x = np.mgrid[:height, :width]

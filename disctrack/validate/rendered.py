@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import AnyArray, Array
 from disctrack.calibrate.stage import calibrate_recording
 from disctrack.disc import Disc
 from disctrack.errors import SceneError
@@ -159,7 +159,7 @@ def render(folder: Path, scene: Scene) -> Truth:
     return truth
 
 
-def reordered(folder: Path, change: Callable[[list[bytes]], Iterable[bytes | NDArray]]) -> None:
+def reordered(folder: Path, change: Callable[[list[bytes]], Iterable[bytes | AnyArray]]) -> None:
     """Reorder, remove, repeat or change the files of a folder, and renumber them; images are encoded as before."""
     files = sorted(folder.iterdir())
     contents = [*change([file.read_bytes() for file in files])]

@@ -5,11 +5,10 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import least_squares
 
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Indices
 from disctrack.discrepancy.score import INVISIBLE
 from disctrack.discrepancy.significance import FALSE_ALARM
 
@@ -56,7 +55,7 @@ def hypotheses(
     shapes = list(_shapes(n, covariates, kinds or {}))
     price = max(float(np.log(n)), float(stats.chi2.isf(FALSE_ALARM / max(len(shapes) - 1, 1), 1)))
 
-    def tested(kind: str, names: Sequence[str], level: NDArray[np.intp], powers: Array) -> Hypothesis:
+    def tested(kind: str, names: Sequence[str], level: Indices, powers: Array) -> Hypothesis:
         """Level : (g,) which of the constants.   powers (k, g) : logarithms of covariates over geometric means."""
         constants = int(level.max()) + 1
 
@@ -94,7 +93,7 @@ def _text(kind: str, names: Sequence[str]) -> str:
 
 def _shapes(
     n: int, covariates: Mapping[str, Sequence[float]], kinds: Mapping[str, Sequence[str]]
-) -> Iterator[tuple[str, tuple[str, ...], NDArray[np.intp], Array]]:
+) -> Iterator[tuple[str, tuple[str, ...], Indices, Array]]:
     """Kind and covariates of each hypothesis that n groups can test; index of its constant and logarithms, by group."""
     usable = {k: x for k, v in covariates.items() if np.isfinite(x := np.asarray(v, float)).all() and (x > 0).all()}
     logarithms: dict[str, Array] = {k: np.log(x) - np.mean(np.log(x)) for k, x in usable.items()}

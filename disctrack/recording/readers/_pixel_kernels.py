@@ -4,8 +4,8 @@ The most significant bit comes first.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from calibration.kit.arrays import AnyArray
 from calibration.kit.compiled import njit
 
 
@@ -15,7 +15,7 @@ def prepare() -> None:
 
 
 @njit(nogil=True, cache=True)
-def undo_filters(rows: NDArray, pixel_bytes: int, out: NDArray) -> bool:  # pragma: no cover (compiled)
+def undo_filters(rows: AnyArray, pixel_bytes: int, out: AnyArray) -> bool:  # pragma: no cover (compiled)
     """Rows (height, 1 + stride), filter type first, to pixels (height, stride); False for an unknown filter type.
 
     PNG specification (ISO/IEC 15948), section 9.2; all sums modulo 256.
@@ -59,7 +59,7 @@ def undo_filters(rows: NDArray, pixel_bytes: int, out: NDArray) -> bool:  # prag
 
 
 @njit(nogil=True, cache=True)
-def unpack_12(packed: NDArray, out: NDArray) -> None:  # pragma: no cover (compiled)
+def unpack_12(packed: AnyArray, out: AnyArray) -> None:  # pragma: no cover (compiled)
     """3 bytes to 2 pixels: packed (3 k,) uint8, out (2 k,) uint16."""
     for i in range(out.size // 2):
         a, b, c = np.uint16(packed[3 * i]), np.uint16(packed[3 * i + 1]), np.uint16(packed[3 * i + 2])
@@ -68,7 +68,7 @@ def unpack_12(packed: NDArray, out: NDArray) -> None:  # pragma: no cover (compi
 
 
 @njit(nogil=True, cache=True)
-def unpack_10(packed: NDArray, out: NDArray) -> None:  # pragma: no cover (compiled)
+def unpack_10(packed: AnyArray, out: AnyArray) -> None:  # pragma: no cover (compiled)
     """5 bytes to 4 pixels: packed (5 k,) uint8, out (4 k,) uint16."""
     for i in range(out.size // 4):
         a, b, c = np.uint16(packed[5 * i]), np.uint16(packed[5 * i + 1]), np.uint16(packed[5 * i + 2])
@@ -80,7 +80,7 @@ def unpack_10(packed: NDArray, out: NDArray) -> None:  # pragma: no cover (compi
 
 
 @njit(nogil=True, cache=True)
-def lzw_codes_follow(packed: NDArray) -> bool:  # pragma: no cover (compiled)
+def lzw_codes_follow(packed: AnyArray) -> bool:  # pragma: no cover (compiled)
     """False if a code (TIFF 6.0, section 13) refers to a string that is not in the table yet.
 
     imagecodecs does not check this, and would read arbitrary memory.

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import NoReturn, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array, Image
+from calibration.kit.arrays import AnyArray, Array, Image
 from disctrack.errors import RecordingError
 
 
@@ -137,7 +136,7 @@ Part = tuple[int, int, int, int]
 Parts = tuple[Part | None, ...]  # of the left and of the right camera
 
 
-def cut_out(image: NDArray, part: Part, where: str) -> NDArray:
+def cut_out(image: AnyArray, part: Part, where: str) -> AnyArray:
     """The part of an image (h, w) or (h, w, channels); an image of the part's size is returned whole.
 
     Raises RecordingError, which begins with `where`, if the image does not contain the part.
@@ -169,7 +168,7 @@ def in_words(image_size: tuple[int, ...], bit_depth: int) -> str:
     return f"{image_size[0]} x {image_size[1]} px of {bit_depth} bit"
 
 
-def room_for(out: NDArray | None, image_size: tuple[int, int], dtype: np.dtype) -> NDArray:
+def room_for(out: AnyArray | None, image_size: tuple[int, int], dtype: np.dtype) -> AnyArray:
     """`out` if an image (width, height) can be decoded directly into it; otherwise a new array."""
     if out is not None and out.shape == image_size[::-1] and out.dtype == dtype and out.flags.c_contiguous:
         return out

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.kit.arguments import Threads, checked
-from calibration.kit.arrays import Mask
+from calibration.kit.arrays import AnyArray, Mask
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.base import FrameReader, in_words
@@ -28,7 +28,7 @@ class PairBlock:
     """
 
     frames: NDArray[np.int64]  # (n,)
-    images: NDArray  # (n, 2 cameras, height, width) uint8 or uint16; 0 if not readable
+    images: AnyArray  # (n, 2 cameras, height, width) uint8 or uint16; 0 if not readable
     unreadable: NotRead = field(default_factory=dict)
 
     @property
@@ -112,7 +112,7 @@ def iter_pair_blocks(
             threads_of_one.shutdown(wait=True, cancel_futures=True)
 
 
-def _fill(images: NDArray, reader: FrameReader, camera: int, frames: range) -> NotRead:
+def _fill(images: AnyArray, reader: FrameReader, camera: int, frames: range) -> NotRead:
     """Fill images (n, height, width) with the reader's frames; those that could not be read are 0 and returned."""
     failed: NotRead = {}
     for image, frame in zip(images, frames, strict=False):

@@ -12,9 +12,8 @@ from pathlib import Path
 import cv2
 import imagecodecs
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Image
+from calibration.kit.arrays import AnyArray, Image
 from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers._pixel_kernels import undo_filters
 from disctrack.recording.readers.base import refuse_colour, room_for
@@ -26,7 +25,7 @@ _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _AGAIN = "Copy or export this image again."
 
 
-def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
+def decode(content: bytes, where: str, out: AnyArray | None = None) -> AnyArray:
     """Pixels of an image file's content as stored: (h, w) or (h, w, channels), any depth; in `out` if it fits.
 
     Container and checksums are verified first: a decoder may return an incomplete image without an error.
@@ -42,15 +41,15 @@ def decode(content: bytes, where: str, out: NDArray | None = None) -> NDArray:
     return _by_opencv(content, where)
 
 
-def _by_opencv(content: bytes, where: str) -> NDArray:
+def _by_opencv(content: bytes, where: str) -> AnyArray:
     with told_as(RecordingError, f"{where}: not a readable image", cv2.error, MemoryError):
-        image: NDArray | None = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        image: AnyArray | None = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise RecordingError(f"{where}: not a readable image, or damaged. {_AGAIN}")
     return image
 
 
-def as_grey(image: NDArray, where: str) -> Image:
+def as_grey(image: AnyArray, where: str) -> Image:
     """(h, w) of 8 or 16 bits: equal channels become one. Raises RecordingError if information would be lost."""
     if image.dtype not in (np.uint8, np.uint16):
         raise RecordingError(f"{where}: pixels of type {image.dtype}; expected 8 or 16 bit grey values.")
@@ -92,7 +91,7 @@ def _jpeg_size(content: bytes) -> tuple[int, int]:
     return 0, 0
 
 
-def _png(content: bytes, where: str, out: NDArray | None) -> NDArray:
+def _png(content: bytes, where: str, out: AnyArray | None) -> AnyArray:
     position, end, view = 8, len(content), memoryview(content)
     chunks: dict[bytes, list[memoryview]] = {}
     while position + 12 <= end and b"IEND" not in chunks:

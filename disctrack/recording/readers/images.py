@@ -15,9 +15,8 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array, Image
+from calibration.kit.arrays import AnyArray, Array, Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader, first_readable
 from disctrack.recording.readers.decoding import as_grey, decode
@@ -44,7 +43,7 @@ def open_images(files: Sequence[Path], camera: str, pattern: str = "") -> FrameR
             raise RecordingError(f"{where}: there is no file with this number. Copy it again from the camera.")
         return content_of(file, where)
 
-    def looked_at(index: int) -> tuple[NDArray, Image]:
+    def looked_at(index: int) -> tuple[AnyArray, Image]:
         name = str(files[index])
         image = decode(content_of(files[index], name), name)
         return image, as_grey(image, name)

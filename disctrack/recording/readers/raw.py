@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kit.arrays import Image
+from calibration.kit.arrays import AnyArray, Image
 from disctrack.errors import RecordingError, told_as
 from disctrack.files.inputs import open_regular
 from disctrack.recording.readers._pixel_kernels import unpack_10, unpack_12
@@ -130,7 +130,7 @@ class PixelLayout:
 
 
 def raw_frames(
-    files: Sequence[RawFile], offsets: NDArray, layout: PixelLayout, notes: tuple[str, ...] = (), **others: Any
+    files: Sequence[RawFile], offsets: AnyArray, layout: PixelLayout, notes: tuple[str, ...] = (), **others: Any
 ) -> FrameReader:
     """Frames of equal size at known offsets in one or several files.
 

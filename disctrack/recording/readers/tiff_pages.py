@@ -11,8 +11,8 @@ from itertools import count
 
 import numpy as np
 import tifffile
-from numpy.typing import NDArray
 
+from calibration.kit.arrays import AnyArray
 from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers._pixel_kernels import lzw_codes_follow
 from disctrack.recording.readers.raw import MOST_PIXELS, PixelLayout, RawFile, check_frame_size
@@ -99,7 +99,7 @@ def _orientation(page: tifffile.TiffPage) -> int:
     return int(page.tags.valueof(274, default=1))
 
 
-def page_pixels(page: Page, where: str) -> NDArray:
+def page_pixels(page: Page, where: str) -> AnyArray:
     """Pixels of a page, (height, width) or (height, width, channels), upright, with black as 0 and palettes applied.
 
     Raises RecordingError that begins with `where`.
@@ -124,8 +124,8 @@ def _check(page: Page, where: str) -> None:
         raise RecordingError(f"{where}: {pieces} do not make up its {width} x {height} px: damaged. Copy it again.")
 
 
-def _decoded(page: tifffile.TiffPage, pieces: list[bytes]) -> NDArray:
-    pixels: NDArray = np.empty(page.shaped, page.dtype)  # separate samples, 1, height, width, samples
+def _decoded(page: tifffile.TiffPage, pieces: list[bytes]) -> AnyArray:
+    pixels: AnyArray = np.empty(page.shaped, page.dtype)  # separate samples, 1, height, width, samples
     for index, piece in enumerate(pieces):
         if page.compression == _LZW and not lzw_codes_follow(np.frombuffer(piece, np.uint8)):
             raise ValueError(f"a code of LZW in piece {index} that nothing explains")
