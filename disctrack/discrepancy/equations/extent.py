@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from calibration.kit.arrays import Array
+from calibration.kit.arrays import Array, Indices
 from disctrack.discrepancy.equations import shooting
-from disctrack.discrepancy.equations.declared import Samples
 from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.fit import TRIAL, Fit, fit
 from disctrack.discrepancy.search import Diagnosis, is_noise
@@ -25,6 +24,7 @@ from disctrack.numbers import measured
 
 SHORTEST = 0.2  # share of a run, of a part that is tested, if that is less than a period: any equations follow less
 END = 1.0 / 64.0  # share of a run, at the end of a part, that has to be noise by itself: a long part hides its end
+BISECTIONS = 20  # of some thousand samples, on both sides: tests whose false alarms add up
 
 
 @dataclass(frozen=True)
@@ -49,80 +49,69 @@ class Extent:
 
 def extent(system: EquationSystem, diagnosis: Diagnosis) -> Extent:
     """The longest first and last part of the only run that the equations, refitted, describe to noise."""
-    return _Parts(system, diagnosis).extent()
+    (run,), changes = system.stretches, dict[str, tuple[float, float]]()
+    seen = np.flatnonzero(np.isfinite(run.data).any(axis=1))
+    first, last, few = 0, 0, max(int(END * len(seen)), 1)
+    with suppress(GivenUp), system.budget.trial(system.trial_steps):
+        first, last = (_longest(system, diagnosis, seen, few, at_end) for at_end in (False, True))
+        if first and last and first + last <= len(seen) + 2 * few:  # both may contain the first samples after an event
+            ends = sorted((seen[first - 1], seen[-last]))
+            changes = _changes(system, diagnosis, *ends)
+    until, since = (float(run.time[seen[i]]) if n else None for i, n in ((first - 1, first), (-last, last)))
+    if changes:
+        until, since = run.time[ends].tolist()
+    return Extent(until, since, changes)
 
 
-class _Parts:
-    """Parts of a run, refitted with what was declared."""
+def _longest(system: EquationSystem, diagnosis: Diagnosis, seen: Indices, few: int, at_end: bool) -> int:
+    """The most of the samples with data in a first part, or a last one `at_end`, of which the equations leave noise."""
+    (run,), values, n = system.stretches, diagnosis.before.values, len(seen)
+    time = run.time[seen] - run.time[seen[0]]
+    shortest = np.searchsorted(time, min(SHORTEST * float(time[-1]), shooting.period(run)))
+    low, high, count = 0, n, max(int(shortest), 2 * len(system.base))
+    while count < high:
+        part = run.part(seen[n - count], len(run.time)) if at_end else run.part(0, seen[count - 1] + 1)
+        fitted = _described(replace(system, stretches=[part]), diagnosis, values, few, at_end)
+        if fitted is None and low == 0:
+            return 0
+        if fitted is None:
+            high = count
+        else:
+            low, values = count, fitted.values
+        count = (low + high + 1) // 2
+    return low
 
-    def __init__(self, system: EquationSystem, diagnosis: Diagnosis) -> None:
-        self.system, self.diagnosis = system, diagnosis
-        (self.run,) = system.stretches
 
-    def extent(self) -> Extent:
-        n, changes = len(self.run.time), dict[str, tuple[float, float]]()
-        until, since = 0, n
-        with suppress(GivenUp), self.system.budget.trial(self.system.trial_steps):
-            until, since = self._longest(at_end=False), n - self._longest(at_end=True)
-            if until > 0 and since < n:  # both may contain the first samples after an event
-                changes = self._changes(*sorted((until, since)))
-        if changes:
-            until, since = sorted((until, since))
-        time = self.run.time.tolist()
-        return Extent(time[until - 1] if until else None, time[since] if since < n else None, changes)
+def _described(part: EquationSystem, diagnosis: Diagnosis, values: Values, few: int, at_end: bool) -> Fit | None:
+    """The fit to a part, the initial state first; None if it leaves more than noise, also in the few that end it."""
+    begin = dict(values) | shooting.initial_guess(part)[0]
+    begin |= fit(part, [q for q in part.base if q.is_initial], begin, TRIAL).values
+    fitted = fit(part, [shooting.with_weak_prior(q) for q in part.base], begin, TRIAL)
+    if not is_noise(fitted, diagnosis.settings, diagnosis.noise):
+        return None
+    rows = np.flatnonzero(part.weights)[slice(few) if at_end else slice(-few, None)]
+    left = float(np.sum(part.linearise(fitted.values, [])[0][rows] ** 2)) / diagnosis.noise
+    limit = stats.chi2.isf(diagnosis.settings.false_alarm / BISECTIONS, np.sum(part.weights[rows]))
+    return fitted if left < limit else None
 
-    def _longest(self, at_end: bool) -> int:
-        """The most samples of a first part, or of a last part `at_end`, of which the equations leave noise."""
-        n, values = len(self.run.time), self.diagnosis.before.values
-        duration = min(SHORTEST * float(np.ptp(self.run.time)), shooting.period(self.run))
-        low, high, count = 0, n, int(np.searchsorted(self.run.time - self.run.time[0], duration))
-        while high - low > 1:
-            part = self.run.part(n - count, n) if at_end else self.run.part(0, count)
-            fitted = self._described(part, values, at_end)
-            if fitted is None and low == 0:
-                return 0
-            if fitted is None:
-                high = count
-            else:
-                low, values = count, fitted.values
-            count = (low + high) // 2
-        return low
 
-    def _described(self, part: Samples, values: Values, at_end: bool) -> Fit | None:
-        """The fit to a part, the initial state first; None if it leaves more than noise, there or where it ends."""
-        there = replace(self.system, stretches=[part])
-        begin = dict(values) | shooting.initial_guess(there)[0]
-        begin |= fit(there, [q for q in there.base if q.is_initial], begin, TRIAL).values
-        fitted = fit(there, [shooting.with_weak_prior(q) for q in there.base], begin, TRIAL)
-        if not self._is_noise(fitted):
-            return None
-        m = max(int(END * len(self.run.time)), 1)
-        rows = slice(m) if at_end else slice(len(part.time) - m, len(part.time))
-        left = float(np.sum(there.linearise(fitted.values, [])[0][rows] ** 2)) / self.diagnosis.noise
-        n_data = max(float(np.sum(there.weights[rows])), 1.0)
-        return fitted if left < stats.chi2.isf(self.diagnosis.settings.false_alarm, n_data) else None
+def _changes(system: EquationSystem, diagnosis: Diagnosis, first: int, last: int) -> dict[str, tuple[float, float]]:
+    """Change of every state from sample `first` to `last`; empty if no numbers hold before and after."""
+    (run,) = system.stretches
+    before, after, between = run.part(0, first + 1), run.part(last, len(run.time)), run.part(0, last + 1)
+    both = replace(system, stretches=[before, after])
+    begin = diagnosis.before.values | shooting.initial_guess(both)[0]
+    fitted = fit(both, [replace(q, slot="") for q in both.base], begin)  # for the covariance of all of them
+    if not (fitted.converged and is_noise(fitted, diagnosis.settings, diagnosis.noise)):
+        return {}
 
-    def _is_noise(self, fitted: Fit) -> bool:
-        return is_noise(fitted, self.diagnosis.settings, self.diagnosis.noise)
+    def change(values: Values) -> Array:
+        motion = both.predict(values, between)
+        return both.start_of(values, after) - (np.nan if motion is None else motion.states[-1])
 
-    def _changes(self, first: int, last: int) -> dict[str, tuple[float, float]]:
-        """Change of every state from sample `first` - 1 to `last`; empty if no numbers hold before and after."""
-        before, after = self.run.part(0, first), self.run.part(last, len(self.run.time))
-        both = replace(self.system, stretches=[before, after])
-        begin = self.diagnosis.before.values | shooting.initial_guess(both)[0]
-        shared = [replace(q, slot="") for q in both.base]  # for the covariance of all of them
-        fitted = fit(both, shared, begin)
-        if not (fitted.converged and self._is_noise(fitted)):
-            return {}
-        between = self.run.part(0, last + 1)
-
-        def change(values: Values) -> Array:
-            motion = both.predict(values, between)
-            return both.start_of(values, after) - (np.nan if motion is None else motion.states[-1])
-
-        now, steps = change(fitted.values), {name: fitted.sigma(name) or 1.0 for name in fitted.names}
-        moved = ({**fitted.values, name: fitted.values[name] + step} for name, step in steps.items())
-        slopes = np.stack([(change(values) - now) / step for values, step in zip(moved, steps.values(), strict=True)])
-        sigmas = np.sqrt(np.diag(slopes.T @ fitted.covariance @ slopes))
-        states = self.system.formulas.equations.states
-        return {name: (float(x), float(sigma)) for name, x, sigma in zip(states, now, sigmas, strict=True)}
+    now, steps = change(fitted.values), {name: fitted.sigma(name) or 1.0 for name in fitted.names}
+    moved = [change({**fitted.values, name: fitted.values[name] + step}) - now for name, step in steps.items()]
+    slopes = np.stack(moved, axis=1) / [*steps.values()]
+    sigmas = np.sqrt(np.maximum(np.diag(slopes @ fitted.covariance @ slopes.T), 0.0))
+    states = system.formulas.equations.states
+    return {name: (float(x), float(sigma)) for name, x, sigma in zip(states, now, sigmas, strict=True)}

@@ -68,3 +68,14 @@ def test_of_what_is_explained_no_extent_is_sought(rng):
     answer = asked(rng, swinging(lambda t, x, v: -0.1 * v * abs(v), [0.5, 0.0], TIME)[0])
     assert answer.found == ("quadratic_v",)
     assert answer.holds is None
+
+
+def test_data_that_begin_late_and_a_gap_change_nothing(rng):
+    row = int(np.searchsorted(TIME, 4.0))
+    first = swinging(lambda t, x, v: 0.0, [0.5, 0.0], TIME[: row + 1])
+    x = np.append(first[0], swinging(lambda t, x, v: 0.0, first[:, -1] + [0.0, 0.4], TIME[row:])[0, 1:])
+    x[:150] = x[700:720] = np.nan
+    holds = asked(rng, x).holds
+    assert holds.until == pytest.approx(4.0, abs=0.05)
+    assert holds.since == pytest.approx(4.0, abs=0.05)
+    assert holds.changes["v"][0] == pytest.approx(0.4, abs=0.01)
