@@ -43,9 +43,9 @@ RTOL = 1e-10  # of the integration: a millionth of the noise
 MIN_NUISANCE = 0.1  # sigmas by which a direction of the rig's covariance moves all dots together at least
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
 # creep at small slip is stiff: its time constant is v / (3 mu g), and steps of the integrator have to be as short
-TRIAL_SLIP_STEPS = 1_000  # per frame, in one trial fit of many; true slip takes hundreds
-ROLLS = 0.2  # of that if the disc cannot slip: for laws with a vanishing width, or that accelerate the disc for ever
-MOST_WORK = 30_000  # per frame: steps of the integrator and rows of derivatives, 10 us each; some laws take half
+TRIAL_WORK = 2_000  # per frame, in one trial fit of many; true slip takes hundreds
+ROLLS = 0.1  # of that in one motion that cannot slip: for laws of vanishing width, or that accelerate the disc for ever
+MOST_WORK = 15_000  # per frame: steps of the integrator and rows of derivatives, 10 us each; some laws take half
 USUAL = 700  # frames, below which a recording may take as much work as with so many
 MOST_SIGMAS = 10.0  # of a size's tolerance, which bound its fit: it must not compensate for a wrong clock
 SLIP_STARTS = (0.9, 0.7, 0.5)  # initial guesses of mu over the largest friction that rolling needs
@@ -99,7 +99,7 @@ class DiscSystem(System):
         safe = np.where(self.used[..., None, None], trajectory.markers_covariance_px2[rows], np.eye(2))
         self._whiten = np.where(self.used[..., None, None], whitening(safe), 0.0)
         self.weights = np.asarray(2.0 * self.used.sum((1, 2)), float)
-        self.trial_steps = TRIAL_SLIP_STEPS * len(self.time)
+        self.trial_work = TRIAL_WORK * len(self.time)
         self.budget = Budget(MOST_WORK * max(len(self.time), USUAL))
         if candidates is None:
             candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
@@ -380,11 +380,10 @@ class DiscSystem(System):
         limit = int(MAX_SWITCHES[0] + MAX_SWITCHES[1] * (times[-1] - times[0]))
         rolls = model.effect("slip") is None and model.effect("creep") is None
         # a motion that needs more steps is given up
-        left = int(min(self.budget.trial_left, self.trial_steps * (ROLLS if rolls else 1.0)))
+        left = int(min(self.budget.trial_left, self.trial_work * (ROLLS if rolls else 1.0)))
         of_state = [n.partition(".")[2] for n in components]
         moving = sensitivities(model, state, times, tuple(parameters.values()), of_state, THETA_END, RTOL, limit, left)
         self.budget.work(moving.n_steps)
-        self.budget.step(moving.slip_steps)
         by_motion, moved = moving.dq.copy(), (*components, *parameters)
         by_motion[:, 3:] = euler_rate_axes_world(moving.q[:, 3], moving.q[:, 4]) @ moving.dq[:, 3:]
         if SLIP in parameters:

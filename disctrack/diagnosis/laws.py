@@ -17,7 +17,7 @@ from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import ResidualTests, residual_tests
 from disctrack.diagnosis.law_library import Family, LearnedLaw, differ_from_zero
 from disctrack.diagnosis.missing_force import Gain, law_of
-from disctrack.discrepancy.fit import TRIAL, Fit, fit
+from disctrack.discrepancy.fit import TRIAL, Fit, attempt
 from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, equivalent, length, noise_gain
 from disctrack.discrepancy.shape import WORTH_A_SHAPE
 from disctrack.discrepancy.significance import SURE, bic_penalty
@@ -160,7 +160,7 @@ def _refitted(system: DiscSystem, base: Fit, law: LearnedLaw | None, current: Fi
 def with_law(system: System, base: Fit, law: LearnedLaw, held: Collection[str] = ()) -> Fit:
     """Fit of the base model and the law's parameters, except those held."""
     moved = (q for q in law.candidate.quantities if q.name not in held)
-    return fit(system, (*base.quantities, *moved), base.values | dict(law.values), TRIAL)
+    return attempt(system, (*base.quantities, *moved), base.values | dict(law.values), TRIAL)
 
 
 def without_idle_terms(system: DiscSystem, law: LearnedLaw, fitted: Fit) -> LearnedLaw:

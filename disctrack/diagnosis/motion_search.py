@@ -121,7 +121,7 @@ def _slips_slowly(settings: Settings, rolling: DiscSystem) -> bool:
     """
     slipping = rolling.again(slips=True)
     try:
-        with slipping.budget.trial(slipping.trial_steps):
+        with slipping.budget.trial(slipping.trial_work):
             alone = fit(slipping, slipping.base, slipping.start(), TRIAL)
     except GivenUp:
         return False

@@ -113,9 +113,9 @@ def fit(system: System, quantities: Sequence[Quantity], start: Values, max_itera
 
 
 def attempt(system: System, quantities: Sequence[Quantity], start: Values, max_iterations: int = MAX_ITERATIONS) -> Fit:
-    """The fit of one hypothesis among many; `no_fit` where it takes more steps than such a trial may."""
+    """The fit of one hypothesis among many; `no_fit` where it takes more work than such a trial may."""
     try:
-        with system.budget.trial(system.trial_steps):
+        with system.budget.trial(system.trial_work):
             return fit(system, quantities, start, max_iterations)
     except GivenUp:
         return no_fit(quantities, start)

@@ -83,39 +83,36 @@ class Candidate:
 
 
 class GivenUp(Exception):
-    """The fit of one hypothesis among many takes too many steps; it is skipped."""
+    """The fit of one hypothesis among many takes too much work; it is skipped."""
 
 
 class Budget:
     """Limit of the computational work, in the system's own units; systems may share it.
 
     Work instead of time, so that an answer does not depend on the machine. When it is used up no further hypothesis is
-    tested, and the answer is the best of those that were. A single trial that takes too many steps is abandoned.
+    tested, and the answer is the best of those that were. A single trial that takes too much is abandoned.
     """
 
     def __init__(self, work: float = np.inf) -> None:
         """Unlimited by default."""
         self._left = self._whole = float(work)
-        self.trial_left = np.inf  # steps until the trial is abandoned
+        self.trial_left = np.inf  # work until the trial is abandoned
 
     def open(self, kept: float = 0.0) -> bool:
         """May another hypothesis be tested, if the share `kept` of the budget is reserved for others?"""
         return np.isinf(self._whole) or self._left > kept * self._whole
 
     def work(self, done: float) -> None:
-        """Count work."""
+        """Count work. Raises GivenUp when that of a trial is used up."""
         self._left -= done
-
-    def step(self, steps: float) -> None:
-        """Count steps of a trial. Raises GivenUp when there are too many."""
-        self.trial_left = max(self.trial_left - steps, 0.0)
+        self.trial_left = max(self.trial_left - done, 0.0)
         if self.trial_left == 0.0:
             raise GivenUp
 
     @contextmanager
-    def trial(self, steps: float) -> Iterator[None]:
-        """Context of one trial that may take so many steps; a nested trial is limited by the outer one, too."""
-        outer, inner = self.trial_left, min(self.trial_left, steps)
+    def trial(self, work: float) -> Iterator[None]:
+        """Context of one trial that may take so much work; a nested trial is limited by the outer one, too."""
+        outer, inner = self.trial_left, min(self.trial_left, work)
         self.trial_left = inner
         try:
             yield
@@ -134,7 +131,7 @@ class System:
     base: tuple[Quantity, ...]  # parameters of every fit: initial conditions, declared laws, nuisances with priors
     candidates: tuple[Candidate, ...]  # effects that the model may lack
     budget: Budget = Budget()
-    trial_steps: float = np.inf  # limit of the steps of one trial
+    trial_work: float = np.inf  # limit of one trial
     several_minima: bool = False  # may fits of the same parameters end in different local minima?
     frees_shapes: bool = False  # are shape parameters fitted where no law in its standard shape fits?
     blocks: Sequence[slice] = ()  # rows that may have parameters of their own (`discrepancy.elimination`)

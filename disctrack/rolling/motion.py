@@ -48,8 +48,7 @@ class Path:
     end: EndReason
     end_time: complex
     end_state: Parts  # (8,), (10,) or (12,)
-    slip_steps: int  # of the integrator in slip, which is stiff at low slip speeds
-    n_steps: int  # of the integrator in total
+    n_steps: int  # of the integrator; slip is stiff at low slip speeds
 
     @property
     def as_seen(self) -> tuple[Parts, Parts]:

@@ -177,7 +177,7 @@ def follow(
     segments: list[tuple[Records, Array]] = []
     switches: list[Switch] = []
     end: EndReason | None = None
-    i, slip_steps, n_steps = 0, 0, 0
+    i, n_steps = 0, 0
 
     def add(times: Array, Y: Numbers) -> None:
         segments.append((assembly.at(regime, times, Y)[2], np.full(len(times), regime, np.uint8)))
@@ -189,7 +189,7 @@ def follow(
         if event < 0:
             system, atol = assembly.system(regime), ATOL[: len(y)]
             Y, t, y, event, n = integrate.integrate(system, t, y, grid[i:], rtol, atol, max_steps - n_steps)
-            n_steps, slip_steps = n_steps + n, slip_steps + (n if regime == SLIPPING else 0)
+            n_steps += n
             if len(Y):  # empty if the steps are used up before the first instant
                 add(grid[i : i + len(Y)], Y)
             i += len(Y)
@@ -207,7 +207,7 @@ def follow(
     if not segments:  # the motion ends at its start
         add(grid[:1], y[None])
     now, regimes = (np.concatenate(parts) for parts in zip(*segments, strict=True))
-    return Path(now, regimes, switches, end, t, y, slip_steps, n_steps)
+    return Path(now, regimes, switches, end, t, y, n_steps)
 
 
 def _event_at_start(assembly: Assembly, regime: int, t: complex, y: Numbers) -> int:
@@ -270,8 +270,7 @@ class Sensitivities:
     dq: Array  # (n, 6, k) in the unit of q per unit of the quantity
     dqdot: Array  # (n, 6, k)
     dstate: Array  # (n, 8, k) of records.ROLLING_COMPONENTS
-    slip_steps: int = 0  # of the integrator in slip, over all runs
-    n_steps: int = 0  # of the integrator in total
+    n_steps: int = 0  # of the integrator, over all runs
 
 
 def sensitivities(
@@ -301,7 +300,7 @@ def sensitivities(
     found = np.full((len(grid), 20, 1 + len(names)), np.nan)  # q, qdot and state: the motion, then its derivatives
     assembly = Assembly(enlarged, theta_end)
     path = follow(assembly, y0, grid, rtol, max_switches, max_steps)
-    spent, n_steps = path.slip_steps, path.n_steps
+    n_steps = path.n_steps
     found[: len(path.now), :, 0] = _numbers(path)
     if path.end is not EndReason.CHATTER:
         same = symmetries(enlarged, assembly) - ({"psi"} if len(y0) > 8 else set())  # initial slip has a direction
@@ -318,11 +317,11 @@ def sensitivities(
                 values = {name: enlarged.values[name] + 1j * _SEED}
             moved = Assembly(enlarged, theta_end, complex, values)
             run = follow(moved, y, grid, rtol, max_steps=max_steps - n_steps)
-            spent, n_steps = spent + run.slip_steps, n_steps + run.n_steps
+            n_steps += run.n_steps
             found[: len(run.now), :, column] = _numbers(run).imag / _SEED
     q, qdot, _ = np.split(found[..., 0], [6, 12], axis=1)
     dq, dqdot, dstate = np.split(found[..., 1:], [6, 12], axis=1)
-    return Sensitivities(grid, q, qdot, names, dq, dqdot, dstate, spent, n_steps)
+    return Sensitivities(grid, q, qdot, names, dq, dqdot, dstate, n_steps)
 
 
 _NUMBERS = (*COORDINATES, *(f"{c}dot" for c in COORDINATES), *ROLLING_COMPONENTS)

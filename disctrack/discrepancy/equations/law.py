@@ -383,7 +383,7 @@ class _Competition:
         shots: Sequence[EquationSystem],
     ) -> list[LearnedForce]:  # fmt: skip
         """The law fitted over longer and longer stretches; none where it loses the data, or takes too many steps."""
-        with suppress(GivenUp), self.system.budget.trial(self.system.trial_steps):
+        with suppress(GivenUp), self.system.budget.trial(self.system.trial_work):
             found = self._fit_over_levels(law, known, own, values, shots)
             return [] if found is None else [found]
         return []

@@ -48,7 +48,7 @@ class EquationSystem(System):
     typical: Mapping[str, float] = field(default_factory=dict)  # typical sizes of the terms' parameters
     guesses: Mapping[str, float] = field(default_factory=dict)  # initial guesses of shapes, fitted at once
     budget: Budget = field(default_factory=lambda: Budget(MOST_WORK))  # shared by all systems of one diagnosis
-    trial_steps = OF_ONE * MOST_WORK
+    trial_work = OF_ONE * MOST_WORK
     several_minima = frees_shapes = True  # users may declare any equations
 
     def __post_init__(self) -> None:
@@ -205,7 +205,6 @@ class EquationSystem(System):
             )  # fmt: skip
         self._steps |= {s.name: steps} if names and steps > 0 else {}
         self.budget.work(abs(steps) * z0.size)
-        self.budget.step(abs(steps) * z0.size)
         if steps <= 0:
             return None
         states, moved = out[:, :n], out[:, n:].reshape(len(times), k, n)

@@ -201,11 +201,11 @@ def test_linear_quantities_that_are_taken_out_beforehand_leave_the_same_fit(rng)
 class Impatient(Oscillator):
     """Will not follow the drift where that is one trial of many."""
 
-    trial_steps = 10.0
+    trial_work = 10.0
 
     def linearise(self, values, names):
         if values.get("drift"):
-            self.budget.step(10.0)
+            self.budget.work(10.0)
         return super().linearise(values, names)
 
 
