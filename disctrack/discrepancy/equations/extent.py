@@ -53,7 +53,8 @@ def extent(system: EquationSystem, diagnosis: Diagnosis) -> Extent:
     seen = np.flatnonzero(np.isfinite(run.data).any(axis=1))
     first, last, few = 0, 0, max(int(END * len(seen)), 1)
     with suppress(GivenUp), system.budget.trial(system.trial_work):
-        first, last = (_longest(system, diagnosis, seen, few, at_end) for at_end in (False, True))
+        first = _longest(system, diagnosis, seen, few, at_end=False)
+        last = _longest(system, diagnosis, seen, few, at_end=True)
         if first and last and first + last <= len(seen) + 2 * few:  # both may contain the first samples after an event
             ends = sorted((seen[first - 1], seen[-last]))
             changes = _changes(system, diagnosis, *ends)
