@@ -412,7 +412,7 @@ def test_a_known_effect_that_stands_in_with_a_law_is_not_claimed(name, beside):
     made = recording(name, 1)
     result = diagnose(made.trajectory)
     assert not result.diagnosis.found
-    assert any(f"[{beside}] is fitted with the law but" in note for note in result.notes)  # it does, by far more than noise
+    assert any(f"[{beside}] is fitted with the law but" in note for note in result.notes)
     assert np.mean(np.abs(pulls(made, result)[0]) < 3) > 0.95
 
 
