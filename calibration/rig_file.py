@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from calibration.board.target import described
+from calibration.board.target import described, target_of
 from calibration.cameras.camera import (
     CAMERA_NAMES,
     INTRINSIC_PARAMETERS,
@@ -371,8 +371,10 @@ def read_beside_cameras(group: h5py.Group, of_cameras: Iterable[Sequence[AnyArra
             raise RigFileError(f"{group.name}/lens_field is not a field of splines")
     if "allowances" in values:
         shifts, marks = values["allowances"], group["allowances"].attrs
-        rows = zip(json.loads(marks["causes"]), shifts, json.loads(marks["assumed"]), strict=True)
-        values["allowances"] = tuple(Allowance(*row) for row in rows)
+        causes, assumed = json.loads(marks["causes"]), json.loads(marks["assumed"])
+        if not len(causes) == len(assumed) == len(shifts):
+            raise RigFileError(f"{group.name}/allowances: rows and causes do not match")
+        values["allowances"] = tuple(map(Allowance, causes, shifts, assumed))
     is_table = bool(group.attrs.get("world_is_table", 0))
     return StereoRig(cameras[0], cameras[1], world_is_table=is_table, **values)
 
@@ -384,6 +386,10 @@ def _read_record(group: h5py.Group) -> Record:
         return json.loads(group[name].asstr()[()] if name in _LONG else group.attrs[name])
 
     record, table_view = {name: text(name) for name in _IN_JSON}, int(group.attrs["table_view"])
-    sizes = {"places": len(record["view_names"]) + len(record["apart"]), "seen": len(group["pixels"])}
+    points, places = len(target_of(record["board"]).points), len(record["view_names"]) + len(record["apart"])
+    sizes = {"points": points, "places": places, "seen": len(group["pixels"])}
     record |= {name: _get(group, name, row, sizes) for name, row in _OF_RECORD.items()}
+    for name, limit in (("view", places), ("camera", 2), ("point", points)):
+        if len(record[name]) and not (record[name].min() >= 0 and record[name].max() < limit):
+            raise RigFileError(f"{group.name}/{name} points beyond the {limit} there are")
     return record | {"table_view": None if table_view < 0 else table_view}

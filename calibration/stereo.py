@@ -199,9 +199,10 @@ def calibrate_from_corners(
     for (v, camera), why in pairs.bad_images.items():
         views[camera][v] = BoardNotFound(why)
     apart = _warnings_of_pairs(pairs, names, table_view)
-    not_used = {v: _listed(images) for v, images in _not_used(views, names).items()}
-    _require_table(table_view, dict.fromkeys(pairs.apart, "".join(apart[:1])) | not_used)
-    _require_fitted(refinement, chain(*_not_used(views, names).values()), wide)
+    not_used = _not_used(views, names)
+    reasons = dict.fromkeys(pairs.apart, "".join(apart[:1])) | {v: _listed(images) for v, images in not_used.items()}
+    _require_table(table_view, reasons)
+    _require_fitted(refinement, chain(*not_used.values()), wide)
     shape = board_shape(refinement, board.points, refinement.inflation)
     common = None if refinement.problem.motion else motion_between_exposures(refinement)[1]
     covariance = stereo_covariance(refinement, common)
@@ -387,6 +388,8 @@ def _used_alone(views: Views, names: Names) -> list[str]:
 def _require_views(views: Views, names: Names, table_view: int | None) -> None:
     if table_view is not None and not 0 <= table_view < len(names):
         raise CalibrationError(f"table view {table_view} does not exist: there are views 0 to {len(names) - 1}")
+    if not views[0]:
+        raise CalibrationError("no calibration views were given")
     for camera, side in enumerate(views):
         found = sum(isinstance(view, CornerView) for view in side)
         if found < MIN_VIEWS:

@@ -115,5 +115,11 @@ _KINDS: dict[str, type[Target]] = {"chessboard": Board, "charuco": CharucoBoard}
 
 
 def described(target: Target) -> dict[str, Any]:
-    """Kind and fields."""
+    """Kind and fields, the argument of `target_of`."""
     return {"target": next(name for name, kind in _KINDS.items() if isinstance(target, kind)), **asdict(target)}
+
+
+def target_of(description: dict[str, Any]) -> Target:
+    """Inverse of `described`."""
+    fields = dict(description)
+    return _KINDS[fields.pop("target")](**fields)

@@ -4,6 +4,7 @@ The prints are drawn by OpenCV, brought into the image by
 OpenCV's warp at six times the resolution, and averaged over the pixels; it shares no line with the code under test.
 """
 
+import json
 import re
 from functools import cache
 
@@ -17,7 +18,7 @@ from calibration import Board, BoardNotFound, CalibrationError, Camera, CornerVi
 from calibration.board import chessboard
 from calibration.board.charuco import find_charuco
 from calibration.board.search import board_size, located, other_board
-from calibration.board.target import CharucoBoard
+from calibration.board.target import CharucoBoard, described, target_of
 from disctrack import calibrate_recording, read_recording
 from disctrack.errors import RecordingError
 from tests.oracles.drawn_boards import draw_board
@@ -111,12 +112,13 @@ def test_other_markers_are_not_found_and_unknown_ones_refused(rng):
     [(Board((9, 6), 8e-3), 1), (Board((9, 5), 8e-3), 2), (Board((6, 6), 8e-3), 4), (CHARUCO, 1)],
     ids=str,
 )
-def test_targets_know_their_symmetry(target, symmetry):
+def test_targets_know_their_symmetry_and_survive_a_file(target, symmetry):
     assert len(target.orders) == symmetry
     for order in target.orders:  # a turn keeps all distances
         d = target.points[order] - target.points[order].mean(0)
         unturned = target.points - target.points.mean(0)
         assert_allclose(d @ d.T, unturned @ unturned.T, atol=1e-15)
+    assert target_of(json.loads(json.dumps(described(target)))) == target
 
 
 AS_CHARUCO = 'target = "charuco"\nsquares = [9, 6]\nsquare_mm = 12.0\nmarker_mm = 8.5\ndictionary = "DICT_4X4_50"'

@@ -78,6 +78,8 @@ def find_motion(left: FrameReader, right: FrameReader, start: int, stop: int, fr
     Frames that cannot be read are skipped.
     """
     margin = max(int(np.ceil(MARGIN * frame_rate)), 2 * STRIDE)
+    if stop - start < 2 * margin:
+        return MotionSpan(start, stop, 0, "too short to leave anything out")
     last_still, looked = _last_still(left, right, range(start, stop))
     if last_still is None:
         return MotionSpan(start, stop, looked, "nothing moves in the whole recording")
