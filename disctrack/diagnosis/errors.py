@@ -10,6 +10,7 @@ from calibration.kit.arrays import Indices
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import state_of
 from disctrack.diagnosis.stretch import MIN_FRAMES
+from disctrack.discrepancy.bisection import most_that_hold
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.held_out import HeldOut
 from disctrack.discrepancy.significance import Whiteness, whiteness
@@ -184,15 +185,13 @@ def valid_ranges(system: DiscSystem, judged: System, base: Fit, noise: float) ->
         return bool(trial.converged and trial.reduced_chi_square <= limit)
 
     def longest(part: Callable[[int], Indices], at: int) -> ValidRange | None:
-        low, high = max(len(frames) // 5, MIN_FRAMES), len(frames)
-        if low >= high or not holds(part(low)):
+        least, n = max(len(frames) // 5, MIN_FRAMES), len(frames)
+        most = most_that_hold(lambda k: holds(part(k)), least, n, max(n // 64, 1))
+        if not most:
             return None
-        while high - low > max(len(frames) // 64, 1):
-            middle = (low + high) // 2
-            low, high = (middle, high) if holds(part(middle)) else (low, middle)
-        rows = part(low)
+        rows = part(most)
         start, stop = system.time[rows[[0, -1]]].tolist()
-        return {"start": start, "stop": stop, "theta_deg": float(theta[rows[at]]), "frames": low}
+        return {"start": start, "stop": stop, "theta_deg": float(theta[rows[at]]), "frames": most}
 
     return {"first": longest(lambda k: frames[:k], -1), "last": longest(lambda k: frames[-k:], 0)}
 

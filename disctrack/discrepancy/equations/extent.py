@@ -15,6 +15,7 @@ import numpy as np
 from scipy import stats
 
 from calibration.kit.arrays import Array, Indices
+from disctrack.discrepancy.bisection import most_that_hold
 from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.fit import TRIAL, Fit, fit
@@ -24,7 +25,6 @@ from disctrack.numbers import measured
 
 SHORTEST = 0.2  # share of a run, of a part that is tested, if that is less than a period: any equations follow less
 END = 1.0 / 64.0  # share of a run, at the end of a part, that has to be noise by itself: a long part hides its end
-BISECTIONS = 20  # of some thousand samples, on both sides: tests whose false alarms add up
 
 
 @dataclass(frozen=True)
@@ -55,32 +55,30 @@ def extent(system: EquationSystem, diagnosis: Diagnosis) -> Extent:
     with suppress(GivenUp), system.budget.trial(system.trial_work):
         first = _longest(system, diagnosis, seen, few, at_end=False)
         last = _longest(system, diagnosis, seen, few, at_end=True)
-        if first and last and first + last <= len(seen) + 2 * few:  # both may contain the first samples after an event
-            ends = sorted((seen[first - 1], seen[-last]))
+    until, since = int(seen[first - 1]) if first else None, int(seen[-last]) if last else None
+    # both parts may contain the first samples after an event
+    if until is not None and since is not None and first + last <= len(seen) + 2 * few:
+        ends = sorted((until, since))
+        with suppress(GivenUp), system.budget.trial(system.trial_work):
             changes = _changes(system, diagnosis, *ends)
-    until, since = (float(run.time[seen[i]]) if n else None for i, n in ((first - 1, first), (-last, last)))
-    if changes:
-        until, since = run.time[ends].tolist()
-    return Extent(until, since, changes)
+        until, since = ends if changes else (until, since)
+    at = run.time.tolist()
+    return Extent(None if until is None else at[until], None if since is None else at[since], changes)
 
 
 def _longest(system: EquationSystem, diagnosis: Diagnosis, seen: Indices, few: int, at_end: bool) -> int:
     """The most of the samples with data in a first part, or a last one `at_end`, of which the equations leave noise."""
-    (run,), values, n = system.stretches, diagnosis.before.values, len(seen)
-    time = run.time[seen] - run.time[seen[0]]
-    shortest = np.searchsorted(time, min(SHORTEST * float(time[-1]), shooting.period(run)))
-    low, high, count = 0, n, max(int(shortest), 2 * len(system.base))
-    while count < high:
+    (run,), n, values = system.stretches, len(seen), dict(diagnosis.before.values)
+
+    def holds(count: int) -> bool:
         part = run.part(seen[n - count], len(run.time)) if at_end else run.part(0, seen[count - 1] + 1)
         fitted = _described(replace(system, stretches=[part]), diagnosis, values, few, at_end)
-        if fitted is None and low == 0:
-            return 0
-        if fitted is None:
-            high = count
-        else:
-            low, values = count, fitted.values
-        count = (low + high + 1) // 2
-    return low
+        values.update(fitted.values if fitted else {})
+        return fitted is not None
+
+    time = run.time[seen] - run.time[seen[0]]
+    shortest = int(np.searchsorted(time, min(SHORTEST * float(time[-1]), shooting.period(run))))
+    return most_that_hold(holds, max(shortest, 2 * len(system.base)), n)
 
 
 def _described(part: EquationSystem, diagnosis: Diagnosis, values: Values, few: int, at_end: bool) -> Fit | None:
@@ -92,7 +90,8 @@ def _described(part: EquationSystem, diagnosis: Diagnosis, values: Values, few: 
         return None
     rows = np.flatnonzero(part.weights)[slice(few) if at_end else slice(-few, None)]
     left = float(np.sum(part.linearise(fitted.values, [])[0][rows] ** 2)) / diagnosis.noise
-    limit = stats.chi2.isf(diagnosis.settings.false_alarm / BISECTIONS, np.sum(part.weights[rows]))
+    bisections = 2.0 * np.log2(len(part.weights))  # on both sides, whose false alarms add up
+    limit = stats.chi2.isf(diagnosis.settings.false_alarm / bisections, np.sum(part.weights[rows]))
     return fitted if left < limit else None
 
 

@@ -77,9 +77,7 @@ def find_missing(
         reason = "the model follows less than a period of the motion, and has no term with which it follows more"
         diagnosis = replace(diagnosis, verdict="unexplained", reason=reason)
         notes.append(reason)
-    judged, holds = diagnosis.judged or system, None
-    if diagnosis.verdict == "unexplained" and len(given) == 1:
-        holds = extent(replace(system, stretches=whole.stretches), diagnosis)
+    judged, runs_whole = diagnosis.judged or system, replace(system, stretches=whole.stretches)
     law = learn(system, diagnosis, channels, None if judged is system else judged)
     named = law is not None and law.is_named(diagnosis)
     notes += on_noise if autocorrelated or not (law and named and law.at_noise) else []
@@ -88,6 +86,8 @@ def find_missing(
         system, diagnosis = law.system, with_law(diagnosis, law)
     else:
         notes += diagnosis.remarks
+    unexplained_alone = diagnosis.verdict == "unexplained" and len(given) == 1
+    holds = extent(runs_whole, diagnosis) if unexplained_alone else None
     notes += [] if system.budget.open() else [USED_UP]
     if system.held:
         held = ", ".join(system.held)

@@ -15,11 +15,7 @@ OSCILLATOR = Equations({"x": "v", "v": "-k*x - c*v"}, {"k": 8.5, "c": 0.1}, unit
 TIME, SIGMA = np.linspace(0, 12, 1200), 1e-3
 
 
-def nothing(t, x, v):
-    return 0.0
-
-
-def swinging(rate, start=(0.5, 0.0), time=TIME):
+def swinging(rate=lambda t, x, v: 0.0, start=(0.5, 0.0), time=TIME):
     def rates(t, y):
         return [y[1], -9.0 * y[0] - 0.2 * y[1] + rate(t, *y)]
 
@@ -34,8 +30,8 @@ def asked(rng, x):
 @pytest.mark.parametrize(("blow", "row", "lost"), [(0.4, 400, ()), (-0.15, 960, ()), (0.4, 400, (range(150), [700]))])
 def test_a_blow_is_told_by_its_instant_and_by_how_much_the_velocity_changed(rng, blow, row, lost):
     """Also where data begin late, and some are missing."""
-    first = swinging(nothing, time=TIME[: row + 1])
-    x = np.append(first[0], swinging(nothing, first[:, -1] + [0.0, blow], TIME[row:])[0, 1:])
+    first = swinging(time=TIME[: row + 1])
+    x = np.append(first[0], swinging(start=first[:, -1] + [0.0, blow], time=TIME[row:])[0, 1:])
     for rows in lost:
         x[rows] = np.nan
     answer = asked(rng, x)
