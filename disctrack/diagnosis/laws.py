@@ -19,7 +19,7 @@ from disctrack.diagnosis.law_library import Family, LearnedLaw, differ_from_zero
 from disctrack.diagnosis.missing_force import Gain, law_of
 from disctrack.discrepancy.fit import TRIAL, Fit, attempt
 from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, equivalent, length, noise_gain
-from disctrack.discrepancy.shape import WORTH_A_SHAPE
+from disctrack.discrepancy.shape import leaves_most
 from disctrack.discrepancy.significance import SURE, bic_penalty
 from disctrack.discrepancy.system import System
 
@@ -76,7 +76,7 @@ def learn(
         known = system.knowing(law)
         enough = len(law.families) == MAX_TERMS or np.isfinite(against)
         # far from the data, a sum whose terms each remove a small part approximates any motion
-        slow = current.excess(noise) > (1 - WORTH_A_SHAPE) * before.excess(noise)
+        slow = leaves_most(current.excess(noise), before.excess(noise))
         enough |= slow and current.reduced_chi_square > FAR * noise
         if enough or (to_noise and _leaves_noise(known, current, noise)):
             break

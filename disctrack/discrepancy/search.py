@@ -22,7 +22,7 @@ from disctrack.discrepancy.fit import Fit, attempt, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import THIRD, inflation, noise_variance, whitened
 from disctrack.discrepancy.score import Linearisation, Score, angle, score_all
-from disctrack.discrepancy.shape import WORTH_A_SHAPE, with_free_shape, with_shape
+from disctrack.discrepancy.shape import WORTH_A_SHAPE, leaves_most, with_free_shape, with_shape
 from disctrack.discrepancy.significance import FALSE_ALARM, TWO_SIDED, Chance, bic_penalty, chance
 from disctrack.discrepancy.system import Candidate, Quantity, System, Values
 
@@ -404,13 +404,13 @@ class _Search:
     def _shortest_of_each_number(self, ranked: Sequence[Explanation]) -> list[Explanation]:
         """The shortest explanations of each number of effects, as long as one effect more describes much more.
 
-        Far from the data, a sum whose terms each remove a small part approximates any motion.
+        A sum whose terms each remove a small part approximates any motion.
         """
         few, left = list[Explanation](), np.inf
         for n in range(self.settings.max_effects + 1):
             alike = [e for e in ranked if len(e.candidates) == n][:WIDTH]
             before, left = left, min((e.fit.excess(self.noise) for e in alike), default=left)
-            if n > 1 and left > (1 - WORTH_A_SHAPE) * before:
+            if n > 1 and leaves_most(left, before):
                 break
             few += alike
         return few

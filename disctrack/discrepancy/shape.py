@@ -16,6 +16,11 @@ WORTH_A_SHAPE = 0.5  # share of the excess that a law must remove before its sha
 DETERMINED = 0.3  # sigma over size, up to which a shape parameter is determined
 
 
+def leaves_most(left: float, before: float) -> bool:
+    """Is less removed of an excess chi-square than a law must remove to be worth more?"""
+    return left > (1 - WORTH_A_SHAPE) * before
+
+
 def with_free_shape(
     system: System, base: Fit, candidate: Candidate, least: float, below: float
 ) -> tuple[Candidate, Fit] | None:

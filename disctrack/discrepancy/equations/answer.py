@@ -23,7 +23,7 @@ from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.noise import OUTLIER, outlier_limit
 from disctrack.discrepancy.search import Diagnosis, Settings, Verdict
-from disctrack.discrepancy.shape import WORTH_A_SHAPE
+from disctrack.discrepancy.shape import leaves_most
 from disctrack.discrepancy.significance import whiteness
 from disctrack.discrepancy.system import Candidate, System
 from disctrack.errors import OutputError
@@ -116,7 +116,7 @@ class Answer:
     def _nearest_notes(self) -> list[str]:
         """Where no term is found: those that gain most, and their residuals."""
         nearest, helpful, d = self.diagnosis.nearest, list[str](), self.diagnosis
-        if nearest is None or nearest.fit.excess(d.noise) > (1 - WORTH_A_SHAPE) * d.before.excess(d.noise):
+        if nearest is None or leaves_most(nearest.fit.excess(d.noise), d.before.excess(d.noise)):
             return []  # what leaves most of it describes nothing
         for c in nearest.candidates:
             numbers = ((q.part, self.nearest.get(q.name, q.null)) for q in (*c.quantities, *c.shape))
