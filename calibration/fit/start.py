@@ -60,7 +60,8 @@ def start_camera(
         raise CalibrationError(f"{name} camera: no start for the calibration, OpenCV says: {error.err}") from error
     finally:
         cv2.setNumThreads(threads)
-    camera = Camera.from_parameters(np.array([*K[[0, 1, 0, 1], [0, 1, 2, 2]], k1, 0, 0, 0, 0]), image_size)
+    fx, fy, cx, cy = (float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    camera = Camera(fx, fy, cx, cy, (k1, 0.0, 0.0, 0.0, 0.0), image_size)
     poses = {
         view: (rotation_from_vector(np.ravel(turn)), np.ravel(shift).astype(float))
         for view, turn, shift in zip(views, turns, shifts, strict=True)

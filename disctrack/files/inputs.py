@@ -46,9 +46,10 @@ def read_regular(path: Path, most: int) -> bytes:
 
 def why_not_regular(path: Path) -> str:
     """Why a path is not a regular file; "" if it is one, or does not exist."""
-    with contextlib.suppress(OSError, ValueError):
+    try:
         return _not_regular(path.stat())
-    return ""
+    except (OSError, ValueError):
+        return ""
 
 
 def _not_regular(status: os.stat_result) -> str:
@@ -92,10 +93,11 @@ _ELSEWHERE = "Choose another place with -o."
 
 def _file(path: Path) -> tuple[int, int] | None:
     """Device and inode, equal for all names of a file; None if it does not exist."""
-    with contextlib.suppress(OSError, ValueError):
+    try:
         status = path.stat()
-        return status.st_dev, status.st_ino
-    return None
+    except (OSError, ValueError):
+        return None
+    return status.st_dev, status.st_ino
 
 
 def _claimed(path: Path) -> str:

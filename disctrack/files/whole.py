@@ -52,9 +52,10 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
 
 def seen_from(folder: Path, path: Path) -> Path:
     """The path as seen from the folder; unchanged if it is on another drive."""
-    with contextlib.suppress(ValueError):
+    try:
         return Path(os.path.relpath(path, folder))
-    return path
+    except ValueError:
+        return path
 
 
 def make_folder(folder: Path) -> None:

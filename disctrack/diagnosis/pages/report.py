@@ -60,7 +60,7 @@ def report_of(
         [*findings, *of_kind(Kind.DIAGNOSIS, Severity.NOTE, notes)],
         blocks=[
             f"Verdict: {d.verdict}, because {d.reason}. Model: {MODELS.get(result.model, result.model)}.",
-            Section("Missing effects", [effects, *_law(result)]),
+            Section("Missing effects", [effects, *_learned_law(result)]),
             planned_section(result.plan),
             Section("Explanations that compete", [explanations_table(d)]),
             Section("Before and after" if result.has_more else "The model", _before_after(result, more)),
@@ -72,7 +72,7 @@ def report_of(
     )
 
 
-def _law(result: DiscDiagnosis) -> list[Listing]:
+def _learned_law(result: DiscDiagnosis) -> list[Listing]:
     """Formulas and numbers of the law that was learned, as in model.toml."""
     if (learned := result.learned) is None:
         return []
