@@ -204,5 +204,5 @@ def validity_text(ranges: Mapping[str, ValidRange | None]) -> str:
     if last := ranges["last"]:
         texts.append(f"holds from {last['start']:.3f} s on (nutation {last['theta_deg']:.2f} deg)")
     if not texts:
-        return "The model fails throughout the recording: the missing effect acts all the time."
-    return f"The model {'; refitted, it '.join(texts)}."
+        return "The model fails throughout the recording: the missing effect acts all the time"
+    return f"The model {'; refitted, it '.join(texts)}"

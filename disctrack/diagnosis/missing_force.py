@@ -21,6 +21,7 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.score import DEPENDENT, cleared, span
 from disctrack.discrepancy.significance import SURE, evidence
 from disctrack.discrepancy.system import Candidate, Quantity, Values
+from disctrack.numbers import rounded
 from disctrack.rolling import EffectParameter, Model, Motion
 from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.records import KINEMATICS
@@ -54,7 +55,7 @@ class Course:
         rms, largest = np.sqrt(np.mean(self.values**2, axis=0)), self.time[np.argmax(size)]
         known = np.flatnonzero(size > SURE**2 * np.sum(self.sigma**2, axis=1))
         text = (
-            f"a moment of {', '.join(f'{1e6 * x:.2g}' for x in rms)} uN m rms along n0, m0, k, or an equivalent "
+            f"a moment of {', '.join(rounded(1e6 * x, 2) for x in rms)} µN m rms along n0, m0, k, or an equivalent "
             f"force; it is largest at {largest:.3f} s"
         )
         first, last = self.time[known[[0, -1]]] if known.size else (largest, largest)

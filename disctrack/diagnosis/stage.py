@@ -152,7 +152,7 @@ def _with_law(
         after, _, course, misfit = with_form(*as_found, _of_motion(f for f in kept if f not in established))
     gain = (diagnosis.before.cost - fitted.cost) / noise
     learned = Learned(law.candidate, gain, held_gain, np.nan, (), law, power, course, misfit)
-    reason = f"{diagnosis.reason}; the law {law.candidate.title} leaves {fitted.reduced_chi_square:.3g}"
+    reason = f"{diagnosis.reason}; the law that was learned leaves {fitted.reduced_chi_square:.3g}"
     diagnosis = replace(
         diagnosis, verdict="unexplained", found=established, after=after, held_out_after=held, reason=reason
     )
