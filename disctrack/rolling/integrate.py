@@ -15,7 +15,7 @@ from calibration.kit.arrays import Array, Numbers
 from calibration.kit.compiled import exact_part, njit
 from disctrack.rolling._compiled import call
 
-RTOL_IMAGINARY = 1e-7  # fifth-order error per step; the relative error of the derivatives is then about 1e-9
+RTOL_IMAGINARY = 1e-6  # fifth-order error per step; the relative error of the derivatives is then about 1e-8
 
 
 class CompiledSystem(NamedTuple):
@@ -122,11 +122,13 @@ def _locate(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def integrate(
-    system: CompiledSystem, t0: complex, y0: Numbers, grid: Array, rtol: float, atol: Array, max_steps: int
-) -> tuple[Numbers, complex, Numbers, int, int]:
+    system: CompiledSystem, t0: complex, y0: Numbers, grid: Array, rtol: float, atol: Array, scale: float,
+    max_steps: int,
+) -> tuple[Numbers, complex, Numbers, int, int]:  # fmt: skip
     """Solve dy/dt = f(t, y) from (t0, y0) to the grid's points, until a positive margin falls to zero.
 
     grid : (n_grid,) increasing, none before t0.   atol : (n,)
+    scale : size that imaginary parts reach, in units of atol, if it is known; else they are resolved from zero on
     Returns y at the grid points that were reached (n_filled, n), instant and state of the event or at the last grid
     point, the index of the margin of the event or -1, and the number of steps. If neither an event nor the last grid
     point is reached, the step became too small, a number is not finite, or the steps were too many.
@@ -135,7 +137,7 @@ def integrate(
     solution = np.empty((grid.size, n), y0.dtype)
     t_box, made = np.empty(1, y0.dtype), dop853.room(y, n + system.n_margins)
     K = made.K
-    size, t, i_grid, event, steps = np.zeros(1), t0 * unit, np.int64(0), -1, 0
+    size, t, i_grid, event, steps = np.full(1, scale), t0 * unit, np.int64(0), -1, 0
     _rates(t, y, K[0], system, t_box)
     h_next = _first_step(y, K[0], atol)
     while event < 0 and i_grid < grid.size and steps < max_steps and h_next >= 1e-15:

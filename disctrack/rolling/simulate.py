@@ -169,8 +169,12 @@ def follow(
     rtol: float = RTOL,
     max_switches: int = MAX_SWITCHES,
     max_steps: int = MOST_STEPS,
+    scale: float = 0.0,
 ) -> Path:
-    """Integrate through the regimes until the grid or the motion ends; complex if the assembly is."""
+    """Integrate through the regimes until the grid or the motion ends; complex if the assembly is.
+
+    scale : as for `integrate.integrate`
+    """
     y = np.array(y, assembly.scalar)
     t: complex = grid[0] * y.dtype.type(1.0)
     regime = (len(y) - 8) // 2
@@ -188,7 +192,7 @@ def follow(
         event = _event_at_start(assembly, regime, t, y)
         if event < 0:
             system, atol = assembly.system(regime), ATOL[: len(y)]
-            Y, t, y, event, n = integrate.integrate(system, t, y, grid[i:], rtol, atol, max_steps - n_steps)
+            Y, t, y, event, n = integrate.integrate(system, t, y, grid[i:], rtol, atol, scale, max_steps - n_steps)
             n_steps += n
             if len(Y):  # empty if the steps are used up before the first instant
                 add(grid[i : i + len(Y)], Y)
@@ -303,6 +307,7 @@ def sensitivities(
     n_steps = path.n_steps
     found[: len(path.now), :, 0] = _numbers(path)
     if path.end is not EndReason.CHATTER:
+        still = Assembly(enlarged, theta_end, complex)
         same = symmetries(enlarged, assembly) - ({"psi"} if len(y0) > 8 else set())  # initial slip has a direction
         for column, name in enumerate(names, start=1):
             if name in same and column <= len(components):
@@ -310,18 +315,29 @@ def sensitivities(
                 if name == "psi":
                     _rotate(found[..., column], found[..., 0])
                 continue
-            y, values = y0.astype(complex), {}
+            y, moved, scale = y0.astype(complex), still, 0.0
             if column <= len(components):
                 y[STATE_COMPONENTS.index(name)] += 1j * _SEED
             else:
-                values = {name: enlarged.values[name] + 1j * _SEED}
-            moved = Assembly(enlarged, theta_end, complex, values)
-            run = follow(moved, y, grid, rtol, max_steps=max_steps - n_steps)
+                moved = Assembly(enlarged, theta_end, complex, {name: enlarged.values[name] + 1j * _SEED})
+                scale = _scale(moved, path, grid)
+            run = follow(moved, y, grid, rtol, max_steps=max_steps - n_steps, scale=scale)
             n_steps += run.n_steps
             found[: len(run.now), :, column] = _numbers(run).imag / _SEED
     q, qdot, _ = np.split(found[..., 0], [6, 12], axis=1)
     dq, dqdot, dstate = np.split(found[..., 1:], [6, 12], axis=1)
     return Sensitivities(grid, q, qdot, names, dq, dqdot, dstate, n_steps)
+
+
+def _scale(moved: Assembly, path: Path, grid: Array) -> float:
+    """Size that imaginary parts reach by a parameter, in units of ATOL, from their rates along the motion.
+
+    Without it, the tail of a short force would be resolved relative to nothing, from 1e-300 of its height on.
+    """
+    few = slice(0, len(path.now), 4)  # a force is longer than a few frames, or its scale is smaller
+    states = columns(path.now[few], *ROLLING_COMPONENTS).astype(complex)
+    rates = np.nan_to_num(moved.at(ROLLING, grid[: len(path.now)][few], states)[0].imag)
+    return float(np.max(np.abs(rates) / ATOL[: rates.shape[1]]) * (grid[-1] - grid[0]) / len(grid))
 
 
 _NUMBERS = (*COORDINATES, *(f"{c}dot" for c in COORDINATES), *ROLLING_COMPONENTS)
