@@ -222,9 +222,13 @@ def explained_by_law(system: DiscSystem, diagnosis: Diagnosis, left: ResidualTes
 
     Among indistinguishable ones, that with the fewest known effects.
     """
-    noise, subsets = diagnosis.noise, _subsets(system, diagnosis, left.doubtful)
-    found = [_law_with(system, diagnosis, kept) for kept in subsets if system.budget.open()]
-    answers = [a for a in found if a is not None and a.fit.converged]
+    noise, answers = diagnosis.noise, list[WithLaw]()
+    for kept in _subsets(system, diagnosis, left.doubtful):
+        answer = _law_with(system, diagnosis, kept) if system.budget.open() else None
+        if answer is not None and answer.fit.converged:
+            answers.append(answer)
+            if diagnosis.verdict != "found" and _leaves_noise(system.knowing(answer.law), answer.fit, noise):
+                break  # beside further effects it would be longer
     if not answers:
         return None, diagnosis
     best = min(equivalent(answers), key=lambda a: sum(f.candidate.kind == "motion" for f in a.kept))
