@@ -43,9 +43,9 @@ RTOL = 1e-9  # of the integration: a ten-thousandth of the noise
 MIN_NUISANCE = 0.1  # sigmas by which a direction of the rig's covariance moves all dots together at least
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
 # creep at small slip is stiff: its time constant is v / (3 mu g), and steps of the integrator have to be as short
-TRIAL_WORK = 2_000  # per frame, in one trial fit of many; true slip takes hundreds
-ROLLS = 0.1  # of that in one motion that cannot slip: for laws of vanishing width, or that accelerate the disc for ever
-MOST_WORK = 15_000  # per frame: steps of the integrator and rows of derivatives, 10 us each; some laws take half
+TRIAL_WORK = 1_000  # per frame, in one trial fit of many; true slip takes hundreds
+ROLLS = 0.2  # of that in one motion that cannot slip: for laws of vanishing width, or that accelerate the disc for ever
+MOST_WORK = 12_000  # per frame: steps of the integrator and rows of derivatives, 5 to 10 us each; some laws take half
 USUAL = 700  # frames, below which a recording may take as much work as with so many
 MOST_SIGMAS = 10.0  # of a size's tolerance, which bound its fit: it must not compensate for a wrong clock
 SLIP_STARTS = (0.9, 0.7, 0.5)  # initial guesses of mu over the largest friction that rolling needs
