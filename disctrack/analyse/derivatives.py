@@ -104,6 +104,11 @@ class MeasuredMotion(MotionState):
         """(n,) True if the motion is determined."""
         return np.asarray(np.isfinite(self.omega_world).all(axis=1))
 
+    def shared_covariance(self, frames: Indices) -> Array:
+        """(f, 18, 18) covariance of STATE by the rig, common to all frames, and by other systematic errors."""
+        S = self.calibration_sensitivity[frames]
+        return np.asarray(S @ self.rig_covariance @ S.swapaxes(1, 2) + self.systematic_at(frames))
+
     def systematic_at(self, frames: Indices) -> Array:
         """(f, 18, 18) covariance of STATE by systematic errors, stationary with a squared-exponential covariance.
 

@@ -133,20 +133,14 @@ class Propagated:
     def covariance(self, frames: Indices, columns: slice = slice(None), shared: bool = False) -> Array:
         """(f, c, c) of some values in some frames by noise, or, if `shared`, by the rig and other systematic errors."""
         motion, J = self.motion, self.jacobian[frames][:, columns]
-        if not shared:
-            return np.asarray(J @ motion.covariance[frames] @ J.swapaxes(1, 2))
-        S = J @ motion.calibration_sensitivity[frames]
-        by_rig = S @ motion.rig_covariance @ S.swapaxes(1, 2)
-        return np.asarray(by_rig + J @ motion.systematic_at(frames) @ J.swapaxes(1, 2))
+        C = motion.shared_covariance(frames) if shared else motion.covariance[frames]
+        return np.asarray(J @ C @ J.swapaxes(1, 2))
 
     def series(self, names: Sequence[tuple[str, str, str]]) -> tuple[DerivedSeries, ...]:
         """The columns as series; names are (name, unit, long_name)."""
-        motion, J, every = self.motion, self.jacobian, np.arange(len(self.value))
-        S = J @ motion.calibration_sensitivity
-        noise = np.sum(J @ motion.covariance * J, axis=-1)
-        shared = np.sum(S @ motion.rig_covariance * S, axis=-1)
-        shared += np.sum(J @ motion.systematic_at(every) * J, axis=-1)
-        sigma, common = (np.sqrt(np.maximum(variance, 0.0)) for variance in (noise, shared))
+        motion, J = self.motion, self.jacobian
+        both = motion.covariance, motion.shared_covariance(np.arange(len(motion)))
+        sigma, common = (np.sqrt(np.maximum(np.sum(J @ C * J, axis=-1), 0.0)) for C in both)
         columns = zip(self.value.T, sigma.T, common.T, strict=True)
         return tuple(DerivedSeries(*name, *column) for name, column in zip(names, columns, strict=True))
 
