@@ -232,25 +232,16 @@ def _images(change: Callable[[float, AnyArray, float], AnyArray], *folders: str)
     return _files(**dict.fromkeys(folders, lambda files, size: redrawn(files, partial(change, size))))
 
 
-def _lost(files: list[bytes], size: int) -> list[bytes]:
-    """Remove files in the middle."""
-    return files[: len(files) // 2] + files[len(files) // 2 + size :]
+def _lost(files: list[bytes], size: int, after: float = 0.5) -> list[bytes]:
+    """Remove files behind this share of all: the first (0), some in the middle, or the last (1)."""
+    first = min(int(after * len(files)), len(files) - size)
+    return files[:first] + files[first + size :]
 
 
 def _repeated(files: list[bytes], size: int) -> list[bytes]:
     """Replace files in the middle by copies of the one before."""
     middle = len(files) // 2
     return files[:middle] + size * [files[middle - 1]] + files[middle + size :]
-
-
-def _last_lost(files: list[bytes], size: int) -> list[bytes]:
-    """Remove the last files, so that both cameras have the same number."""
-    return files[:-size]
-
-
-def _first_lost(files: list[bytes], size: int) -> list[bytes]:
-    """Remove the first files."""
-    return files[size:]
 
 
 def _damaged(files: list[bytes], size: int) -> list[bytes]:
@@ -295,6 +286,7 @@ def _wrong(section: str, key: str, *kinds: Kind, smallest: float = 3e-3) -> Plan
     return Planting([smallest * size for size in (1, 10, 100)], "1", change, kinds, section == "calibration")
 
 
+_first_lost, _last_lost = partial(_lost, after=0), partial(_lost, after=1)  # both cameras then have as many files
 _LOST = (Kind.DROPPED_FRAMES, Kind.DELAY, Kind.ONE_SIDED)
 _REPEATED = (Kind.REPEATED_IMAGES,)
 _VIEWS = ("calibration/left", "calibration/right")
