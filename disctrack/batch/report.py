@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from disctrack.batch.columns import FALSE_DISCOVERY, FITTED, Fitted, Row, copies
+from disctrack.batch.columns import FALSE_DISCOVERY, FITTED, Fitted, Row, copies, repeats_of
 from disctrack.batch.records import FAILED, MEASURED, NOT_MEASURED, SKIPPED
 from disctrack.findings import Finding, Kind, Severity, of_kind
 from disctrack.frames import CAMERAS
@@ -15,15 +15,11 @@ SAID = {SKIPPED: "measured before"}  # words for a status whose name only suits 
 
 
 def report_of(
-    rows: Sequence[Row],
-    repeats: Sequence[Row] = (),
-    others: Sequence[Finding] = (),
-    together: str = "",
-    files: Sequence[Path] = (),
+    rows: Sequence[Row], others: Sequence[Finding] = (), together: str = "", files: Sequence[Path] = ()
 ) -> Report:
     """Report of all recordings of a batch.
 
-    repeats : from `repeats_of`; others : findings that do not belong to a single recording
+    others : findings that do not belong to a single recording
     together : page of the diagnosis of all, relative to that of the batch; "" if there is none
     """
     header = ("recording", "", "status", "pairs", *(f.label for f in FITTED), "rms (px)", "χ²", "diagnosis")
@@ -44,7 +40,7 @@ def report_of(
         blocks=[
             Section("Results", [what, table, Markup(data)]),
             Section("All recordings together", [Markup(link)] if together else ()),
-            Section("Repeats", _repeats(repeats) if repeats else ()),
+            Section("Repeats", _repeats(rows)),
         ],
         files=files,
         page=next((file for file in files if file.name == "index.html"), None),
@@ -81,7 +77,10 @@ def _noticed(rows: Sequence[Row]) -> Iterator[Finding]:
         yield Finding(Kind(row["finding"]), severity, text)
 
 
-def _repeats(repeats: Sequence[Row]) -> list[str | Listing]:
+def _repeats(rows: Sequence[Row]) -> list[str | Listing]:
+    repeats = repeats_of(rows)
+    if not repeats:
+        return []
     said = (
         "Mean and standard deviation over the recordings of one disc on one surface, from one case as declared. "
         "χ² is their squared spread over the stated variances, per degree of freedom: far above 1, with a small "

@@ -67,7 +67,7 @@ class BatchOutcome:
         others += of_kind(
             Kind.OTHER, Severity.NOTE, [f"{name}: left out, images and no {FILE_NAME}" for name in self.undeclared]
         )
-        found = report_of(self.rows, repeats_of(self.rows), others, TOGETHER if self.together else "", self.files)
+        found = report_of(self.rows, others, TOGETHER if self.together else "", self.files)
         together = f" All together: {self.together}" if self.together else ""
         return replace(found, verdict=found.verdict + together)
 
@@ -252,7 +252,7 @@ def write_summary(
             found.common / "summary.json": json_file(document),
             found.common / "summary.csv": as_csv(COLUMNS, rows),
             found.common / "repeats.csv": as_csv(REPEATS, repeats),
-            found.common / "index.html": page(report_of(rows, repeats, together=together)).encode(),
+            found.common / "index.html": page(report_of(rows, together=together)).encode(),
         }
         for file, content in files.items():
             write_whole(file, content)
