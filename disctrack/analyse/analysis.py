@@ -122,14 +122,12 @@ def _findings(trajectory: Trajectory, motion: MeasuredMotion, onset: RollingOnse
                 f"the scatter of the {name} is {np.sqrt(scale):.2f} times what the tracker states; the sigmas here "
                 "follow the scatter"
             )
-    if not onset.probability >= 0.5:
-        return
     if onset.low > motion.time[motion.known][0]:
         yield (
             f"where slip ends, at {onset.time:.4f} s, the acceleration jumps: the motion before and after was "
             "differentiated apart, so that sigmas are larger near that instant"
         )
-    if onset.n_late_slips:
+    if onset.n_late_slips and onset.probability >= 0.5:
         yield (
             f"after the onset of rolling, {onset.n_late_slips} frames still show slip beyond five sigmas: stick and "
             "slip, or impacts"

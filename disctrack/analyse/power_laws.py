@@ -143,11 +143,10 @@ def power_law_end(time: Array, psi: Array, psidot: Array) -> float:
     turned = np.maximum.accumulate(psi[known])  # the angle of a stopped disc only fluctuates
     before = np.interp(turned - 2 * np.pi, turned, time[known], left=np.nan)
     mean = 2 * np.pi / (time[known] - before)  # over the turn that ends here
-    if not np.isfinite(mean).any():
-        return float(time[known[-1]])
-    peak = int(np.nanargmax(mean))
-    if mean[-1] < (1 - BRAKE_DROP) * mean[peak]:
-        return float(time[known[peak]] - BRAKE_MARGIN)
+    if np.isfinite(mean).any():
+        peak = int(np.nanargmax(mean))
+        if mean[-1] < (1 - BRAKE_DROP) * mean[peak]:
+            return float(time[known[peak]] - BRAKE_MARGIN)
     return float(time[known[-1]])
 
 

@@ -27,18 +27,16 @@ def report_of(
 
     trajectory, laws, energy = analysis.trajectory, analysis.laws, analysis.energy
     t_f = Measured(laws.t_f, laws.t_f_sigma)
+    lost = Measured(energy.loss, np.hypot(energy.loss_sigma, energy.loss_sigma_calibration), "J")
     return Report(
         f"{provenance.recording}: from the trajectory to the physics",
         f"The disc {analysis.onset.verdict}. {_exponents_text(laws)}",
         _accuracy(analysis),
         [*carried(trajectory.findings), *analysis.findings],
         facts=[
-            (
-                "energy lost (± 1 σ)",
-                Measured(energy.loss, np.hypot(energy.loss_sigma, energy.loss_sigma_calibration), "J"),
-            ),
+            ("energy lost (± 1 σ)", lost),
             ("collapse t_f (s, ± 1 σ)", t_f if laws.determined else "not in reach"),
-            ("exponent of θ (95 %)", _at_95(laws.n_theta) if laws.determined else "not determined"),
+            ("exponent of θ (95 %)", _at_95(laws.n_theta)),
         ],
         blocks=[
             Facts([*(trajectory.facts() | trajectory.disc.facts()).items()]),
