@@ -11,6 +11,7 @@ always zero: as calibrated, as declared.
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -89,13 +90,11 @@ class Fault:
             numbers = tuple(float(self.null + self.factor * x) for x in v)
             value = numbers if len(numbers) > 1 else numbers[0]
         place = replace(place, **{key: value})
-        changed: dict[str, Any] = {camera: place} if camera else vars(place)
-        return replace(faults, **changed)
+        return replace(faults, **{camera: place}) if camera else place
 
     def from_scene(self, faults: Faults, rate: float) -> Array:
         """Inverse of `to_scene`."""
-        camera, _, key = self.key.rpartition(".")
-        value = getattr(getattr(faults, camera) if camera else faults, key)
+        value = attrgetter(self.key)(faults)
         if self.from_key is not None:
             return np.atleast_1d(np.asarray(self.from_key(value, rate), float))
         return np.asarray((np.atleast_1d(value) - self.null) / self.factor, float)
