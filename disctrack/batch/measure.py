@@ -39,18 +39,17 @@ BUSY_FOR = 1.0  # [s] to wait for another batch before the job is put back; long
 
 def do(job: Job) -> Row:
     """Do a job. Never raises an Exception: errors are reported in the row, which is stored with the results."""
-    results = Path(job.results)
     try:
-        with locked(results / LOCK, BUSY_FOR):
+        with locked(job.results / LOCK, BUSY_FOR):
             try:
-                return make_rig(job) if job.kind == "rig" else make_recording(job, results)
+                return make_rig(job) if job.kind == "rig" else make_recording(job)
             except Exception as error:
                 kind = Kind.OTHER
                 if isinstance(error, TrackingError):
                     kind = error.findings[0].kind if error.findings else Kind.DISC_NOT_FOUND
                 row = failed(reason_of(error), kind)
                 with contextlib.suppress(DiscTrackError):  # if this fails, only the running batch reports the error
-                    write_row(results, row)
+                    write_row(job.results, row)
                 return row
     except Timeout:
         return outcome(BUSY)
@@ -61,42 +60,42 @@ def do(job: Job) -> Row:
 def make_rig(job: Job) -> Row:
     """Calibrate and write job.rig, unless it is already the result of the same inputs."""
     source = source_of(read_recording(job.folder))
-    if is_rig_of(Path(job.rig), source) and not job.options.overwrite:
+    if is_rig_of(job.rig, source) and not job.options.overwrite:
         return outcome(SKIPPED)
-    calibrate_into(Path(job.rig), source, overwrite=True, figures=job.options.report)
+    calibrate_into(job.rig, source, overwrite=True, figures=job.options.report)
     return outcome(MEASURED)
 
 
-def make_recording(job: Job, results: Path) -> Row:
+def make_recording(job: Job) -> Row:
     """Track, analyse and, if requested, diagnose; existing results of the same inputs are kept."""
     began, used = time.perf_counter(), time.process_time()
     recording = read_recording(job.folder)
     rig, pairs = read_rig(job.rig), open_pairs(recording)
-    path, provenance = results / "trajectory.h5", trajectory_provenance(recording, rig, pairs, None)
+    path, provenance = job.results / "trajectory.h5", trajectory_provenance(recording, rig, pairs, None)
 
     def measured() -> tuple[Trajectory, Details]:
-        found = measure(recording, rig, pairs, threads=job.threads, boards=boards_in(Path(job.rig), recording))
+        found = measure(recording, rig, pairs, threads=job.threads, boards=boards_in(job.rig, recording))
         return found.trajectory, found.details
 
     trajectory, _, fresh = kept_or_made(path, provenance, measured, job.options.overwrite)
-    kept = None if fresh else read_row(results)  # is_done checks that it has the trajectory's provenance
-    if kept is not None and is_done(results, kept, job.options.stages):
+    kept = None if fresh else read_row(job.results)  # is_done checks that it has the trajectory's provenance
+    if kept is not None and is_done(job.results, kept, job.options.stages):
         return kept | {"status": SKIPPED}
-    row: Row = plain(_after_tracking(results, path, trajectory, job)) | {
+    row: Row = plain(_after_tracking(path, trajectory, job)) | {
         "name": recording.name,
         "repeats": group_of(recording),
-        "rig": job.rig,
+        "rig": str(job.rig),
         "input_sha256": json_sha256(dict(provenance.inputs)),
         "fingerprint": provenance.fingerprint,
         "version": provenance.version,
         "seconds": round(time.perf_counter() - began, 3),
         "processor_seconds": round(time.process_time() - used, 3),
     }
-    write_row(results, row)
+    write_row(job.results, row)
     return row
 
 
-def _after_tracking(results: Path, path: Path, trajectory: Trajectory, job: Job) -> Row:
+def _after_tracking(path: Path, trajectory: Trajectory, job: Job) -> Row:
     """Analysis, loss coefficient, diagnosis; if one is not possible, `reason` says why, and the status is MEASURED."""
     row = {"trajectory": path.name, "stages": job.options.stages, **tracked_numbers(trajectory)}
     noticed = leading(trajectory.findings)
@@ -105,7 +104,7 @@ def _after_tracking(results: Path, path: Path, trajectory: Trajectory, job: Job)
     try:
         if job.options.report:
             analysed = run_analyse(path, window=job.options.window, overwrite=True)
-            analysis, row["report"] = analysed.analysis, analysed.report.relative_to(results).as_posix()
+            analysis, row["report"] = analysed.analysis, analysed.report.relative_to(job.results).as_posix()
         else:
             analysis = analyse(trajectory, job.options.window)
             write_analysis(path, analysis)
@@ -123,7 +122,7 @@ def _after_tracking(results: Path, path: Path, trajectory: Trajectory, job: Job)
                 "diagnosis": diagnosed.data["verdict"],
                 "diagnosis_sentence": diagnosed.data["sentence"],
                 "diagnosis_p_value": diagnosed.data["chance"].get("p_value"),
-                "diagnosis_report": diagnosed.files[0].relative_to(results).as_posix(),
+                "diagnosis_report": diagnosed.files[0].relative_to(job.results).as_posix(),
             }
         except AnalysisError as error:
             missing.append(f"not diagnosed: {reason_of(error)}")

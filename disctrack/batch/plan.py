@@ -109,9 +109,9 @@ class Job:
 
     kind: str  # "rig" or "recording"
     name: str  # of the recording; for a rig, the first recording that needs it
-    folder: str  # of that recording
-    results: str  # folder of the results
-    rig: str  # rig file: output of a "rig", input of a "recording"
+    folder: Path  # of that recording
+    results: Path  # folder of the results
+    rig: Path  # rig file: output of a "rig", input of a "recording"
     options: BatchOptions
     threads: int = 1  # for reading images
 
@@ -124,7 +124,7 @@ def make_plan(
     returns : jobs of rigs and of recordings, rows of recordings that fail before they begin, by name, and folders of
         images that no recording.toml declares
     """
-    rigs: dict[str, Job] = {}
+    rigs: dict[Path, Job] = {}
     jobs: list[Job] = []
     failures: dict[str, Row] = {}
     undeclared = found.undeclared
@@ -139,8 +139,8 @@ def make_plan(
             if rig is None:
                 # the folder's name is the hash of all inputs of the calibration
                 rig = found.common / "rigs" / source_of(recording).provenance.fingerprint[:16] / "rig.h5"
-                rigs.setdefault(str(rig), Job("rig", name, str(folder), str(rig.parent), str(rig), options))
-            jobs.append(Job("recording", name, str(folder), str(found.results(folder)), str(rig), options))
+                rigs.setdefault(rig, Job("rig", name, folder, rig.parent, rig, options))
+            jobs.append(Job("recording", name, folder, found.results(folder), rig, options))
         except Exception as error:  # an error of one recording must not stop the others
             failures[name] = failed(reason_of(error), about)
     needed = {job.rig for job in jobs}

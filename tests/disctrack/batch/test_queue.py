@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import unquote
 
@@ -91,7 +92,7 @@ def test_no_folder_and_no_recording_are_told_apart(tmp_path):
 
 
 def job(name, rig="given.h5", kind="recording"):
-    return Job(kind, name, f"/{name}", f"/{name}/results", rig, BatchOptions())
+    return Job(kind, name, Path("/", name), Path("/", name, "results"), Path(rig), BatchOptions())
 
 
 RIG = job("a", "shared.h5", "rig")
