@@ -94,7 +94,7 @@ def _view_at(start: Array, values: Array, inner_corners: tuple[int, int]) -> Cor
     rough = _orient(start, values, inner_corners)
     if isinstance(rough, BoardNotFound):
         return rough
-    view = fit_view(values, rough, inner_corners)
+    view = fit_view(values, rough, inner_corners, np.ones(len(rough), bool))
     if view.accepted.mean() < MIN_ACCEPTED:
         return BoardNotFound(
             f"only {view.accepted.sum()} of {len(view.accepted)} corners lie on a regular grid: the board is covered "

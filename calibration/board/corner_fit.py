@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 
 from calibration.board._corner_kernel import N_CORNER, fit_corners
-from calibration.board.target import LEAST_POINTS
+from calibration.board.target import LEAST_POINTS, grid_of
 from calibration.kit.arrays import AnyArray, Array, Indices, Mask
 
 LEAST_SIGMA = 0.05  # px, least standard deviation of a corner that no model fits
@@ -55,20 +55,13 @@ class CornerView:
         return replace(self, reasons=tuple(self.reasons[i] for i in order), **arrays)
 
 
-def fit_view(
-    grey: Array,
-    rough: Array,
-    inner_corners: tuple[int, int],
-    seen: Mask | None = None,
-    plain: float = 1.0,
-) -> CornerView:
+def fit_view(grey: Array, rough: Array, inner_corners: tuple[int, int], seen: Mask, plain: float = 1.0) -> CornerView:
     """Fit every corner twice: first to estimate blur, noise, curvature and contrast gradients, then with these.
 
     rough : (n, 2) [px] of all corners; those that are not `seen` (n,) are interpolated from the others
     plain : width in squares of the light squares' plain margin, between an edge and a marker
     """
     noise, blur, known = np.array([1.0, 0.0]), 1.0, np.zeros((len(rough), 4))
-    seen = np.ones(len(rough), bool) if seen is None else seen
     axes = local_axes(rough, seen, inner_corners)
     starts = _starts(grey, rough, axes, blur, 0.7 * min(plain, 0.57))
     for iterations, tolerance, most in ((12, 1e-2, FIRST_REACH), (30, 1e-5, np.inf)):
@@ -281,7 +274,7 @@ def saddle_points(grey: Array, points: Array, spacing: float) -> Array:
 
 def local_axes(points: Array, ok: Mask, inner_corners: tuple[int, int]) -> Array:
     """Image of one step along i and along j at every corner, (n, 2 axes, 2) [px], from the view's homography."""
-    board, use = _indices(inner_corners), ok if ok.sum() >= LEAST_POINTS else np.ones(len(points), bool)
+    board, use = grid_of(inner_corners)[:, :2], ok if ok.sum() >= LEAST_POINTS else np.ones(len(points), bool)
     H = np.asarray(cv2.findHomography(board[use], points[use])[0], float)
     image = np.column_stack([board, np.ones(len(board))]) @ H.T
     places, depth = image[:, :2] / image[:, 2:], image[:, 2:]
@@ -304,12 +297,6 @@ def grey_at(image: AnyArray, places: Array) -> Array:
     return np.where(inside, image[y, x].reshape(*x.shape, -1).mean(axis=-1), np.nan)
 
 
-def _indices(inner_corners: tuple[int, int]) -> Array:
-    columns, rows = inner_corners
-    j, i = np.divmod(np.arange(columns * rows), columns)
-    return np.stack([i, j], axis=-1).astype(float)
-
-
 def degree_for(n: int, most: int) -> int:
     """Degree of a polynomial in two coordinates that n corners determine, with three corners per coefficient."""
     return max(d for d in range(most + 1) if 3 * (d + 1) * (d + 2) <= 2 * n or d == 0)
@@ -323,7 +310,7 @@ def smooth_grid(points: Array, inner_corners: tuple[int, int], seen: Mask) -> tu
     """
     columns, rows = inner_corners
     seen = seen if seen.sum() >= LEAST_POINTS else np.ones(len(points), bool)
-    board = _indices(inner_corners)
+    board = grid_of(inner_corners)[:, :2]
     H = np.asarray(cv2.findHomography(board[seen], points[seen], cv2.LMEDS)[0], float)
     plane = np.asarray(cv2.perspectiveTransform(board[None], H)[0], float)
     degree = max(degree_for(int(seen.sum()), 3), 1)

@@ -36,7 +36,7 @@ class Board:
     @property
     def points(self) -> Array:
         """Inner corners (n, 3) [m] in board axes; the third coordinate is zero."""
-        return _grid(self.inner_corners) * self.square
+        return grid_of(self.inner_corners) * self.square
 
     @property
     def orders(self) -> list[Indices]:
@@ -86,7 +86,7 @@ class CharucoBoard:
     @property
     def points(self) -> Array:
         """Inner corners (n, 3) [m], from the upper left, row by row."""
-        return (_grid(self.inner_corners) * [1, -1, 1] + [0, self.inner_corners[1] - 1, 0]) * self.square
+        return (grid_of(self.inner_corners) * [1, -1, 1] + [0, self.inner_corners[1] - 1, 0]) * self.square
 
     @property
     def orders(self) -> list[Indices]:
@@ -97,7 +97,7 @@ class CharucoBoard:
         return f"a ChArUco board of {self.squares[0]} x {self.squares[1]} squares ({self.dictionary})"
 
 
-def _grid(counts: tuple[int, int]) -> Array:
+def grid_of(counts: tuple[int, int]) -> Array:
     """(n, 3) positions, along i first, then along j."""
     j, i = np.mgrid[: counts[1], : counts[0]]
     return np.stack([i.ravel(), j.ravel(), np.zeros(i.size)], axis=-1)
