@@ -51,6 +51,7 @@ class Edge(NamedTuple):
     level: float = 200.0  # grey value of the paper
     contrast: float = 0.85  # of the dots with the paper
     noise: NoiseModel = NoiseModel(1.0, 0.02)
+    saturation: int | None = None  # grey value at which the brighter side is clipped; None: it is not
 
 
 def rough_noise(image: Image) -> NoiseModel:
@@ -132,7 +133,7 @@ def _response(sizes: Array, edge: Edge) -> Array:
     the template's band of pixels, weighted by their noise. The other parameters (size, blur, grey values) are even
     about the centre, and do not couple.
     """
-    sigma, level, contrast, noise = edge
+    sigma, level, contrast, noise, _ = edge
     d = np.linspace(-3.0 * sigma - 2.0, 3.0 * sigma + 1.0, ACROSS)  # [px] as `_kernels` selects its pixels
     seen = 0.5 * np.array([math.erfc(x) for x in d / (np.sqrt(2.0) * sigma)])  # share of the dot
     grey = 1.0 - contrast * seen

@@ -92,7 +92,6 @@ class Follower:
     measured: bool = False  # blur and noise are known
     acquisitions: int = 0
     first_reason: str = ""  # why the first search failed
-    saturated: tuple[int | None, ...] = (None, None)  # grey value at which the dots' brighter side is clipped
     first_row: int = 0  # of the stretch in the tables
 
 
@@ -268,7 +267,7 @@ def _nearest_alike(pose: Pose, following: Pose, disc: Disc) -> Pose:
 
 def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, heading: Heading) -> None:
     """Measure noise and blur of the cameras; `measured` stays False if the disc is not seen."""
-    n, saturated = min(SAMPLE, len(images)), list(follower.saturated)
+    n = min(SAMPLE, len(images))
     edges = [Edge(noise=rough_noise(images[seen.argmax(), camera])) for camera, seen in enumerate(readable[:n].T)]
     # the second time with the blur and the residual noise of the first
     for limits in (kernels.Limits(blur=np.inf, share=MOST_USUAL), kernels.Limits()):
@@ -282,9 +281,8 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, h
             if len(fits):
                 noise = residual_noise(edges[camera].noise, fits)
                 blur, level, contrast = (float(np.median(fits[name])) for name in ("sigma", "level", "contrast"))
-                edges[camera] = Edge(blur, level, contrast, noise)
-                saturated[camera] = _saturated(images[:done, camera], fits, noise)
-    follower.edges, follower.saturated, follower.measured = tuple(edges), tuple(saturated), True
+                edges[camera] = Edge(blur, level, contrast, noise, _saturated(images[:done, camera], fits, noise))
+    follower.edges, follower.measured = tuple(edges), True
 
 
 def _saturated(images: Image, fits: AnyArray, noise: NoiseModel) -> int | None:

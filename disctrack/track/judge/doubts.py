@@ -248,11 +248,11 @@ def _symmetric(disc: Disc) -> Iterator[Finding]:
 
 
 def _clipped(follower: Follower) -> Iterator[Finding]:
-    for camera, saturation in zip(frames.CAMERAS, follower.saturated, strict=True):
-        if saturation is not None:
+    for camera, edge in zip(frames.CAMERAS, follower.edges, strict=True):
+        if edge.saturation is not None:
             text = (
-                f"{camera} camera: the brighter side of the dots' edges is clipped at grey value {saturation}, which "
-                "hides part of them and of the noise: positions may be off by a micrometre"
+                f"{camera} camera: the brighter side of the dots' edges is clipped at grey value {edge.saturation}, "
+                "which hides part of them and of the noise: positions may be off by a micrometre"
             )
             advice = (Remedy(action="expose for a shorter time"),)
             where = Subject("track", camera)
