@@ -301,7 +301,11 @@ def _begin(views: Views, board: Target, names: Names) -> tuple[Pairs, list[str]]
     for v, order in orders.items():
         view = views[1][v]
         views[1][v] = view.reordered(order) if isinstance(view, CornerView) else view
-    return start, [*notes, _choice_of_origin(board)]
+    choice = (
+        f"{board} looks the same after a turn: the two cameras were made to agree, but which corner is the lab frame's "
+        "origin is a choice (i points to the right in the left image). An odd by an even count leaves no choice."
+    )
+    return start, [*notes, choice]
 
 
 def _fit_jointly(
@@ -427,14 +431,6 @@ def _observations(views: Views) -> Observations:
                 place = (np.full(len(index), number) for number in (v, camera))
                 parts.append((*place, index, view.points[index], view.covariance[index]))
     return Observations(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
-
-
-def _choice_of_origin(board: Target) -> str:
-    return (
-        f"{board} looks the same after a turn: the two cameras were made to agree, but which corner is the lab "
-        "frame's origin is a choice (i points to the right in the left image). "
-        + ("An odd by an even count leaves no choice." if isinstance(board, Board) else "A ChArUco board has none.")
-    )
 
 
 def _warnings_of_pairs(pairs: Pairs, names: Names, table_view: int | None) -> list[str]:
