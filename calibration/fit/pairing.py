@@ -9,7 +9,7 @@ long tails: the log likelihood of a pair is minus the logarithm of its squared d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -101,18 +101,21 @@ def _same_place(side: Sequence[CornerView | BoardNotFound]) -> Mask:
     return same
 
 
-def poses_of(poses: Mapping[int, Pose], seen_by: Observations, points: Array, camera: Camera) -> BoardPoses:
-    """Poses with covariances. seen_by : observations of the camera;  points : (n, 3) [m] of the target"""
+def poses_of(poses: Iterable[tuple[int, Pose]], seen_by: Observations, points: Array, camera: Camera) -> BoardPoses:
+    """Poses in images of these numbers, with covariances.
+
+    seen_by : observations of the camera;  points : (n, 3) [m] of the target
+    """
     middle = points.mean(0)
-    found: list[tuple[Array, Array, Array]] = []
-    for view, (R, t) in poses.items():
+    found: list[tuple[int, Array, Array, Array]] = []
+    for view, (R, t) in poses:
         seen, at = points[seen_by.point[seen_by.view == view]] @ R.T + t, R @ middle + t
         d_point = project_with_jacobians(seen, camera)[1]
         J = np.concatenate([by_turning(d_point, seen - at), d_point], axis=-1).reshape(-1, 6)
         information = J.T @ J / len(seen)
         information += 1e-9 * np.diag(np.diag(information))  # points on a line leave one rotation undetermined
-        found.append((R, at, np.linalg.inv(information)))
-    return BoardPoses(np.array(list(poses)), *(np.stack(part) for part in zip(*found, strict=True)))
+        found.append((view, R, at, np.linalg.inv(information)))
+    return BoardPoses(*(np.stack(part) for part in zip(*found, strict=True)))
 
 
 def apart(left: BoardPoses, right: BoardPoses, R_pair: Array, t_pair: Array) -> Array:

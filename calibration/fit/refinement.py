@@ -109,7 +109,7 @@ def refined(problem: Problem, model: StereoModel, kept: Mask, extra: float, reje
         model, total = minimum.model, total + minimum.iterations
         residuals = observations.pixels - predict_pixels(model, observations)
         final, extra = extra, _extra_variance(residuals[kept], used.covariance, dof)
-    own = _mahalanobis2(residuals[kept], observations.covariance[kept], 0.0)
+    own = quadratic(inverse_covariance(used.covariance, 0.0), residuals[kept])
     return Refinement(
         model=model,
         observations=observations,
@@ -173,12 +173,9 @@ def _median_variance(residuals: Array) -> float:
 def _accepted(problem: Problem, residuals: Array, extra: float, beyond: float, among: Mask | bool = True) -> Mask:
     """Points (m,) whose residuals are below a number of sigmas; none of a place with too few of them for its pose."""
     place = problem.places
-    good = (_mahalanobis2(residuals, problem.observations.covariance, extra) < beyond**2) & among
+    square = quadratic(inverse_covariance(problem.observations.covariance, extra), residuals)
+    good = (square < beyond**2) & among
     return np.asarray(good & (np.bincount(place, good)[place] >= min(LEAST_POINTS, len(problem.shape_basis))), bool)
-
-
-def _mahalanobis2(residuals: Array, covariance: Array, extra: float) -> Array:
-    return quadratic(inverse_covariance(covariance, extra), residuals)
 
 
 def _extra_variance(residuals: Array, covariance: Array, dof: float) -> float:

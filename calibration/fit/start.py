@@ -82,7 +82,7 @@ def start_stereo(
     begun = [start_camera(observations, index, nominal, size) for index, size in enumerate(image_sizes)]
     cameras, poses, _ = zip(*begun, strict=True)
     sides = [observations[observations.camera == index] for index in (0, 1)]
-    places = [poses_of(seen, o, nominal, camera) for o, (camera, seen, _) in zip(sides, begun, strict=True)]
+    places = [poses_of(seen.items(), o, nominal, camera) for o, (camera, seen, _) in zip(sides, begun, strict=True)]
     floor = FLOOR * max(max(size) for size in image_sizes)
     pairs, notes = paired((places[0], places[1]), nominal, len(orders), floor, names)
     both = [v for v in poses[0] if v in poses[1]]

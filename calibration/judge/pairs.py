@@ -208,9 +208,8 @@ def compared(observations: Observations, pairs: Pairs, table_view: int | None, f
     for index, (R, t) in enumerate(model.rig.camera_poses()):
         mine = observations[observations.camera == index]
         poses = zip(R @ model.R_left_board[views, index], model.t_left_board[views, index] @ R.T + t, strict=True)
-        sides.append(
-            poses_of(dict(zip(views.tolist(), poses, strict=True)), mine, model.points, model.rig.cameras[index])
-        )
+        numbered = zip(views.tolist(), poses, strict=True)
+        sides.append(poses_of(numbered, mine, model.points, model.rig.cameras[index]))
     known = np.all([np.isfinite(side.covariance).all(axis=(1, 2)) for side in sides], axis=0)
     views, (left, right) = views[known], (side[known] for side in sides)
     R, t = relative_poses(left, right)
