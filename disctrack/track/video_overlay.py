@@ -3,6 +3,7 @@
 import contextlib
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 
 import cv2
@@ -51,16 +52,13 @@ def write_overlay(
         >>> write_overlay("five.mp4", frames, read_trajectory("clip")).name
         'five.mp4'
     """
-    path, stream = Path(path), iter(pairs)
-    first = next(stream, None)
+    path, pictures = Path(path), (draw_pair(images, trajectory, row) for row, images in pairs)
+    first = next(pictures, None)
     if first is None:
         raise OutputError(f"{path}: no frame to draw")
-    picture = draw_pair(first[1], trajectory, first[0])
-    with whole_file(path, suffix=".mp4") as part, _encoder(part, picture.shape[:2]) as write:
-        write(picture)
-        progress(1)
-        for row, images in stream:
-            write(draw_pair(images, trajectory, row))
+    with whole_file(path, suffix=".mp4") as part, _encoder(part, first.shape[:2]) as write:
+        for picture in chain([first], pictures):
+            write(picture)
             progress(1)
     return path
 
