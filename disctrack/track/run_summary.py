@@ -70,7 +70,11 @@ def left_out(found: StereoCalibration) -> list[str]:
 
 def trajectory_rows(trajectory: Trajectory, details: Mapping[str, Any]) -> Iterator[Row]:
     """Frames measured and lost with the reasons, sigmas, reprojection error."""
-    yield from _frame_lines(trajectory)
+    yield "frames", frames_text(trajectory)
+    for status in FrameStatus:
+        rows = np.flatnonzero(trajectory.frame_status == status)
+        if status != FrameStatus.MEASURED and rows.size:
+            yield "", f"{rows.size} {status.sentence} (frames {ranges(trajectory.frame[rows])})"
     if found := details.get("first_pass"):
         looked = f" (first pass, {found['looked_at']} pairs looked at)" if found["looked_at"] else ""
         yield "motion", f"{found['verdict']}{looked}"
@@ -114,14 +118,6 @@ def frames_text(trajectory: Trajectory) -> str:
 def sigma_text(trajectory: Trajectory) -> str:
     """Uncertainty of a pose, in one line."""
     return _sigma_text(trajectory.coordinate_sigma, "median of the frames, noise of one frame")
-
-
-def _frame_lines(trajectory: Trajectory) -> Iterator[Row]:
-    yield ("frames", frames_text(trajectory))
-    for status in FrameStatus:
-        rows = np.flatnonzero(trajectory.frame_status == status)
-        if status != FrameStatus.MEASURED and rows.size:
-            yield ("", f"{rows.size} {status.sentence} (frames {ranges(trajectory.frame[rows])})")
 
 
 def _sigma_text(sigma: Array, what: str) -> str:
