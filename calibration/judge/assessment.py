@@ -100,17 +100,8 @@ def tilt_spread(refinement: Refinement) -> float:
     return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1))).max())
 
 
-def point_uncertainty(rig: StereoRig, points_world: Array) -> Array:
-    """Standard deviations (n, 3) [m] of triangulated points (n, 3) [m] due to the calibration alone.
-
-    That is, for images without noise.
-    """
-    shift = _shifts_of_points(rig, points_world)
-    return np.sqrt(np.maximum(np.einsum("nip,pq,niq->ni", shift, rig.covariance, shift), 0.0))
-
-
-def _shifts_of_points(rig: StereoRig, points_world: Array) -> Array:
-    """(n, 3, 30) d point / d RIG_PARAMETERS at fixed pixels."""
+def shifts_of_points(rig: StereoRig, points_world: Array) -> Array:
+    """(n, 3, 30) d point / d RIG_PARAMETERS at fixed pixels, of triangulated points (n, 3) [m]."""
     _, d_world, d_rig = rig.project_with_jacobians(points_world)
     J = np.moveaxis(d_world, 0, 1).reshape(len(points_world), 4, 3)
     K = np.moveaxis(d_rig, 0, 1).reshape(len(points_world), 4, -1)
@@ -135,7 +126,7 @@ def length_uncertainty(rig: StereoRig, points_world: Array) -> tuple[float, floa
     for displacements.
     """
     middle, size = points_world.mean(0), float(np.sqrt(np.mean(np.var(points_world, axis=0)) * 3))
-    shift = _shifts_of_points(rig, middle + 0.5 * size * np.concatenate([np.eye(3), -np.eye(3)]))
+    shift = shifts_of_points(rig, middle + 0.5 * size * np.concatenate([np.eye(3), -np.eye(3)]))
     change = (shift[:3] - shift[3:]) / size  # (3 lines, 3 axes, 30)
     variance = np.einsum("lap,pq,laq->la", change, rig.covariance, change)
     own = float(np.trace(variance)) / 3
@@ -153,9 +144,11 @@ def assess(
     kept = refinement.observations[refinement.kept]
     both = np.intersect1d(kept.view[kept.camera == 0], kept.view[kept.camera == 1])
     volume = measurement_volume(refinement, rig.world_is_table)
-    sigma = np.linalg.norm(point_uncertainty(rig, volume), axis=-1)
+    shift = shifts_of_points(rig, volume)  # of points in images without noise
+    variance = np.einsum("nip,pq,niq->ni", shift, rig.covariance, shift)
+    sigma = np.linalg.norm(np.sqrt(np.maximum(variance, 0.0)), axis=-1)
     along, across = length_uncertainty(rig, volume)
-    place, most = causes(rig_with_board, _shifts_of_points(rig_with_board, volume))
+    place, most = causes(rig_with_board, shift)
     misfit, held_out_error = held_out(refinement)
     found = Assessment(
         stereo_misfit_px=misfit,

@@ -16,7 +16,7 @@ from calibration import (
 )
 from calibration.board.chessboard import board_orders
 from calibration.cameras.camera import rotation_from_vector, triangulate
-from calibration.judge.assessment import point_uncertainty
+from calibration.judge.assessment import shifts_of_points
 from calibration.judge.tolerances import BoardTolerances, table_pose
 from tests.oracles.drawn_boards import corner_view, draw_board, make_scene
 
@@ -62,7 +62,7 @@ def test_lab_frame_from_images_is_right_within_its_uncertainty(drawn):
     m = scene.model
     true_rig = replace(m.rig, R_left_world=R, t_left_world=t)
     error = triangulate(true_rig.project(points), found.rig) - points
-    sigma = point_uncertainty(found.rig, points)
+    sigma = np.sqrt([np.diag(J @ found.rig.covariance @ J.T) for J in shifts_of_points(found.rig, points)])
     assert np.abs(error / sigma).max() < 4.5
     assert np.abs(error).max() < 20e-6  # cameras of 240 x 192 px, 0.55 mm per px, 8 views
     assert sigma.max() < 20e-6
