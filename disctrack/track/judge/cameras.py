@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, WORLD_SHIFT, WORLD_TURN, StereoRig
-from calibration.kit.arrays import Array, Indices, Mask
+from calibration.kit.arrays import Array, Mask
 from disctrack.analyse.quantities import SIGMAS
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS, vector_from_rotation
@@ -71,13 +71,12 @@ def frames_ahead(left: Array, right: Array) -> int:
     return best if one and misfit[best] ** 2 < (1 - LATE) * misfit[0] ** 2 else 0
 
 
-def delay_of_right(seen: DotsInFrames, rows: Indices) -> tuple[float, float]:
-    """Frame periods by which the right camera is ahead in these frames, and the fraction of the misfit explained by it.
+def delay_of_right(seen: DotsInFrames) -> tuple[float, float]:
+    """Frame periods by which the right camera is ahead, and the fraction of the misfit explained by it.
 
     (0, 0) if no frame has both neighbours.
     """
-    inside = rows[(rows > 0) & (rows < len(seen.t) - 1)]
-    rows = evenly(inside[seen.posed[inside]], SHARED_FRAMES)
+    rows = evenly(np.flatnonzero(seen.posed[1:-1]) + 1, SHARED_FRAMES)
     velocity = np.zeros_like(seen.pixels[rows])
     velocity[:, 1] = 0.5 * (seen.pixels[rows + 1, 1] - seen.pixels[rows - 1, 1])
     some = replace(seen.at(rows), further=velocity[..., None])

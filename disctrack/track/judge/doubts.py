@@ -164,7 +164,7 @@ def doubts_of(
     if scatter.whole > min(FAULTY * scatter.free, HOPELESS) and systematic_px > ORDINARY_PX:
         times = np.sqrt(scatter.whole / scatter.noise)
         text = f"the dots miss their fitted places by {times:.1f} times their scatter ({systematic_px:.3f} px)"
-        found.append(_misfit(text, *delay_of_right(seen, np.flatnonzero(seen.posed)), trajectory.frame_rate))
+        found.append(_misfit(text, *delay_of_right(seen), trajectory.frame_rate))
     elif scatter.noise > 4.0:
         text = (
             f"the dots scatter {np.sqrt(scatter.noise):.1f} times more than the image noise explains: they are not "
