@@ -6,7 +6,7 @@ singular; psi, theta, phi are computed from the result (`frames.euler_from_rotat
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -56,7 +56,8 @@ class DotsInFrames:
     covariance: Array  # (n, 2, m, 2, 2) [px^2]
     R: Array  # (n, 3, 3); NaN where there is no pose
     t: Array  # (n, 3) [m]
-    further: Array | None = None  # (n, 2, m, 2, j) derivatives of the pixels by the further parameters
+    # (n, 2, m, 2, j) derivatives of the pixels by the further parameters; by default there are none
+    further: Array = field(default_factory=lambda: np.zeros((1, 1, 1, 2, 0)))
 
     @property
     def posed(self) -> Mask:
@@ -68,11 +69,20 @@ class DotsInFrames:
         parts = {name: getattr(self, name)[rows] for name in ("pixels", "covariance", "R", "t")}
         return replace(self, **parts)
 
+    def delayed(self, rows: Indices) -> DotsInFrames:
+        """Some of the frames, with a further parameter: frame periods by which the right camera is ahead.
+
+        rows : frames with both neighbours
+        """
+        by_delay = 0.5 * (self.pixels[rows + 1] - self.pixels[rows - 1])
+        by_delay[:, 0] = 0.0
+        return replace(self.at(rows), further=by_delay[..., None])
+
     def shifted(self, shift: Array) -> DotsInFrames:
         """Rig and positions of the dots after the shift, and pixels without the effect of the further parameters."""
         places = slice(N_RIG, N_RIG + 2 * self.disc.n_markers)
         moved = np.column_stack([shift[places].reshape(-1, 2), np.zeros(self.disc.n_markers)])
-        pixels = self.pixels if self.further is None else self.pixels - self.further @ shift[places.stop :]
+        pixels = self.pixels - self.further @ shift[places.stop :]
         disc = replace(self.disc, marker_centres_body=self.disc.marker_centres_body + moved)
         return replace(self, rig=self.rig.perturbed(shift[:N_RIG]), disc=disc, pixels=pixels)
 
@@ -100,8 +110,7 @@ class DotsInFrames:
         by_place = by_pose[..., :3] @ self.R[:, None, None, :, :2]
         for k in range(self.disc.n_markers):
             by_shared[:, :, k, :, N_RIG + 2 * k : N_RIG + 2 * k + 2] = by_place[:, :, k]
-        if self.further is not None:
-            by_shared[..., -self.further.shape[-1] :] = W @ self.further
+        by_shared[..., N_RIG + 2 * self.disc.n_markers :] = W @ self.further
         rows = np.concatenate([by_pose, by_shared[..., free], residuals], axis=-1)
         rows = np.where((used & np.isfinite(rows).all(axis=(-2, -1)))[..., None, None], rows, 0.0)
         square = normal_of_rows(rows.reshape(len(rows), -1, rows.shape[-1]), 6).eliminated()

@@ -13,8 +13,6 @@ they recur, and are part of the scatter. If they do not, as the disc settles, th
 a rotation explains hardly any of them.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, WORLD_SHIFT, WORLD_TURN, StereoRig
@@ -77,10 +75,8 @@ def delay_of_right(seen: DotsInFrames) -> tuple[float, float]:
     (0, 0) if no frame has both neighbours.
     """
     rows = evenly(np.flatnonzero(seen.posed[1:-1]) + 1, SHARED_FRAMES)
-    velocity = np.zeros_like(seen.pixels[rows])
-    velocity[:, 1] = 0.5 * (seen.pixels[rows + 1, 1] - seen.pixels[rows - 1, 1])
-    some = replace(seen.at(rows), further=velocity[..., None])
-    used = np.isfinite(some.pixels + velocity).all(axis=-1)
+    some = seen.delayed(rows)
+    used = np.isfinite(some.pixels + some.further[..., 0]).all(axis=-1)
     used &= used.sum(axis=(1, 2), keepdims=True) >= 4
     free = np.append(np.zeros(N_RIG + 2 * seen.disc.n_markers, bool), True)
     ((normal,),), (gradient,), whole = some.normal(np.zeros(len(free)), used, free)

@@ -12,7 +12,7 @@ differences amplify white noise by 30 (rms), and reduce a precession by an angle
 5 mm. So only frames with slower precession are used.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -42,19 +42,16 @@ def without_shared_faults(frames: DotsInFrames) -> AsBuilt | None:
 
     None if fewer than MIN_FRAMES frames are complete together with both neighbours.
     """
-    rig, disc, pixels = frames.rig, frames.disc, frames.pixels
-    complete = np.asarray(np.isfinite(pixels).all((1, 2, 3)) & frames.posed)
+    rig, disc = frames.rig, frames.disc
+    complete = np.asarray(np.isfinite(frames.pixels).all((1, 2, 3)) & frames.posed)
     rows = evenly(np.flatnonzero(complete[:-2] & complete[1:-1] & complete[2:]) + 1, SHARED_FRAMES)
     if len(rows) < MIN_FRAMES:
         return None
-    by_delay = 0.5 * (pixels[rows + 1] - pixels[rows - 1])  # per frame period
-    by_delay[:, 0] = 0.0
-
     m = disc.n_markers
     camera = [_WIDE[name] for name in INTRINSIC_PARAMETERS]
     wide = np.concatenate([camera, camera, _WIDE_POSE, _WIDE_POSE, np.full(2 * m, DOT_SIGMA), [1.0]])
     wide[:N_RIG] *= (np.diag(rig.covariance) > 0) & (np.arange(N_RIG) < PAIR_SHIFT.stop)
-    shift, covariance, _, last = fit_shared(replace(frames.at(rows), further=by_delay[..., None]), wide)
+    shift, covariance, _, last = fit_shared(frames.delayed(rows), wide)
     dots = slice(N_RIG, N_RIG + 2 * m)
     _, fits = last.fitted(True, shift)
     spent = int(fits.degrees_of_freedom[fits.converged].sum())
