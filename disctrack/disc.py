@@ -105,9 +105,14 @@ def disc_from_mm(
     )
 
 
+def _dots(disc: Disc) -> Array:
+    """Centres of the dots (n,) as complex numbers x + i y [m]."""
+    return np.asarray(disc.marker_centres_body[:, :2] @ (1, 1j))
+
+
 def _onto_itself(disc: Disc, places: Array) -> Mask:
-    """Whether all dots of layouts (..., n, 2) [m] coincide with dots of the disc to a tenth of their diameter."""
-    gaps = np.linalg.norm(places[..., None, :] - disc.marker_centres_body[:, :2], axis=-1)
+    """Whether all dots of layouts (..., n), x + i y [m], coincide with the disc's to a tenth of their diameter."""
+    gaps = np.abs(places[..., None] - _dots(disc))
     return np.asarray(gaps.min(axis=-1).max(axis=-1) < 0.1 * disc.marker_diameter)
 
 
@@ -116,21 +121,16 @@ def symmetry_order(disc: Disc) -> int:
 
     With an order n > 1 the spin angle phi is known only modulo 2 pi / n.
     """
-    order = 1
-    for n in range(2, 2 * disc.n_markers + 1):
-        angle = 2 * np.pi / n
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        if _onto_itself(disc, disc.marker_centres_body[:, :2] @ turn.T):
-            order = n
-    return order
+    orders = range(2, 2 * disc.n_markers + 1)
+    return max((n for n in orders if _onto_itself(disc, _dots(disc) * np.exp(2j * np.pi / n))), default=1)
 
 
 def has_mirror_axis(disc: Disc) -> bool:
     """True if the layout of the dots is mirror-symmetric, so that it does not reveal a mirrored image."""
-    z = disc.marker_centres_body[:, 0] + 1j * disc.marker_centres_body[:, 1]
+    z = _dots(disc)
     far = z[np.argmax(np.abs(z))]  # its mirror image is a dot, possibly itself
     mirrored = np.exp(1j * (np.angle(far) + np.angle(z)))[:, None] * np.conj(z)
-    return bool(_onto_itself(disc, np.stack([mirrored.real, mirrored.imag], axis=-1)).any())
+    return bool(_onto_itself(disc, mirrored).any())
 
 
 def precession_rate(
@@ -169,15 +169,13 @@ def nutation_frequency(theta: float, disc: Disc, gravity: float = 9.81, omega3: 
     p, q = precession_rate(theta, disc, gravity, omega3)
     r, h, m, J1 = disc.radius, disc.half_thickness, disc.mass, disc.moment_diametral
     I1, I2, I3 = J1 + m * (r**2 + h**2), J1 + m * h**2, disc.moment_axial + m * r**2
-    s, c = np.sin(theta), np.cos(theta)
     d_omega2, d_omega3 = followers(theta, p, q, disc)
-    # row e1 with a = omega2 = psidot s, b = omega3:
-    # I1 theta'' = I2 a^2 c/s - (I3 + m r h c/s) a b + m r h a^2 - m g L1
-    a, b = p * s, q
-    by_theta = -I2 * a**2 / s**2 + m * r * h * a * b / s**2 + m * gravity * (r * s + h * c)
-    by_a = 2 * I2 * a * c / s - (I3 + m * r * h * c / s) * b + 2 * m * r * h * a
-    by_b = -(I3 + m * r * h * c / s) * a
-    square = -(by_theta + by_a * d_omega2 + by_b * d_omega3) / I1
+    step = 1e-30j  # of theta, along the oscillation: the imaginary part carries the exact derivative
+    s, c = np.sin(theta + step), np.cos(theta + step)
+    a, b = p * np.sin(theta) + step * d_omega2, q + step * d_omega3
+    # row e1 with a = omega2 = psidot s, b = omega3:  I1 theta'' =
+    moment = I2 * a**2 * c / s - (I3 + m * r * h * c / s) * a * b + m * r * h * a**2 - m * gravity * (r * c - h * s)
+    square = -float((moment / step).real) / I1
     if square <= 0:
         raise ModelError(
             f"regular precession at {np.degrees(theta):.4g} deg is unstable: there is no nutation oscillation"
