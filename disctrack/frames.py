@@ -125,9 +125,7 @@ def continuous_quaternions(q: Array) -> Array:
     """(n, 4) with signs chosen so that successive quaternions have a positive product; NaN rows are skipped."""
     q = np.array(q, float)
     good = np.flatnonzero(np.isfinite(q).all(axis=-1))
-    if good.size == 0:
-        return q
-    dots = np.sum(q[good[1:]] * q[good[:-1]], axis=-1)
-    signs = np.concatenate([[1.0 if q[good[0], 0] >= 0 else -1.0], np.where(dots < 0, -1.0, 1.0)])
+    first, dots = q[good[:1], 0], np.sum(q[good[1:]] * q[good[:-1]], axis=-1)
+    signs = np.where(np.concatenate([first, dots]) < 0, -1.0, 1.0)
     q[good] *= np.cumprod(signs)[:, None]
     return q
