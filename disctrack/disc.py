@@ -86,7 +86,7 @@ def disc_from_mm(
     radius_mm: float,
     thickness_mm: float,
     mass_g: float,
-    marker_centres_mm: list[list[float]] | Array,
+    marker_centres_mm: ArrayLike,
     marker_diameter_mm: float,
     radius_tolerance_mm: float | None = None,
     thickness_tolerance_mm: float | None = None,

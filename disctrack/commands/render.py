@@ -26,16 +26,16 @@ def run(arguments: argparse.Namespace) -> None:
 
 def rendered(file: Path, folder: Path, truth_file: Path | None, quiet: bool) -> None:
     """Render the scene file into the folder, with a progress bar, and print the files."""
+    scene = load_scene(file)
     with tqdm(unit="image", file=sys.stderr, disable=quiet or None) as bar:
 
         def progress(done: int, total: int) -> None:
             bar.total = total
             bar.update(done - bar.n)
 
-        truth = run_render(file, folder, truth_file, progress)
+        truth = run_render(scene, folder, truth_file, progress)
     views = f"{len(truth.R_world_board)} views of the chessboard"
     print(f"{folder}: {len(truth.time)} pairs of frames at {truth.frame_rate:g} Hz, {views}")
-    scene = load_scene(file)
     if scene.motion.kind == "rolling":
         print(f"effects: {effects_in_words(scene)}")
     print(f"truth, for comparison only: {truth_file or folder / 'truth.h5'}")

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from disctrack.disc import AIR_DENSITY, MA_2014, Disc, disc_from_mm
 from disctrack.errors import SceneError
@@ -208,6 +208,8 @@ class RenderSettings:
 class Scene:
     """Everything that determines a synthetic recording."""
 
+    read_by: ClassVar[str] = "disctrack.synthetic.description:load_scene"
+
     name: str = "scene"
     seed: int = limited(1, (0, math.inf))
     gravity_m_s2: float = limited(9.81, POSITIVE)
@@ -230,10 +232,8 @@ class Scene:
     @property
     def declared_disc(self) -> Disc:
         """The disc as declared in recording.toml."""
-        d = self.disc
-        return disc_from_mm(
-            d.radius_mm, d.thickness_mm, d.mass_g, [list(c) for c in self.markers.centres_mm], self.markers.diameter_mm
-        )
+        dots = self.markers
+        return disc_from_mm(**vars(self.disc), marker_centres_mm=dots.centres_mm, marker_diameter_mm=dots.diameter_mm)
 
     def changed(self, **values: object) -> "Scene":
         """Copy with other values; those of a section in a dictionary, as in the TOML file."""

@@ -114,8 +114,6 @@ def table_cells(view: View, pad: int, s: int, scene: Scene) -> Array32:
     """Grey values of the empty table in all cells of the padded image: (rows * s, columns * s)."""
     look = scene.appearance
     points = table_points(view, pad)
-    if look.table_streaks == 0 and look.table_blotches == 0:
-        return np.full((s * (points.shape[0] - 1), s * (points.shape[1] - 1)), look.table, np.float32)
     texture = _texture(scene.seed, look.table_streaks, look.table_blotches, look.streak_direction_deg)
     return _textured_cells(points, s, look.table, texture)
 

@@ -14,7 +14,7 @@ from scipy.interpolate import PPoly
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array, Array32, Image
+from calibration.kit.arrays import Array, Array32
 from calibration.rig_file import write_rig_group
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError, told_as
@@ -23,7 +23,7 @@ from disctrack.frames import COORDINATES, rotation_from_euler
 from disctrack.recording.declaration import KEYS
 from disctrack.recording.declaration_text import declaration_text
 from disctrack.synthetic.cameras import board_poses, rig_of
-from disctrack.synthetic.description import ImperfectionSettings, Scene, load_scene, scene_toml
+from disctrack.synthetic.description import ImperfectionSettings, Scene, scene_toml
 from disctrack.synthetic.images import expected_board_image, expected_disc_image, stages
 from disctrack.synthetic.motion import motion_of, rolling_model, true_exposure, true_frame_rate
 from disctrack.synthetic.optics import digitise
@@ -57,22 +57,26 @@ class Truth:
         return marker_pixels(R, q[..., :3], self.rig_while_filming, self.disc.marker_centres_body)[0]
 
 
-Job = tuple[Path, Callable[[], Image]]  # a file, and the function that renders its image
+# A file, the function that renders its image, and the seed of its own noise, so that the image does not depend on the
+# order or the number of threads
+Job = tuple[Path, Callable[[], Array32], list[int]]
 
 
-def write_recording(
-    folder: str | Path,
-    scene: Scene,
-    *,
-    truth_path: str | Path | None = None,
-    progress: Progress | None = None,
+@checked
+def run_render(
+    scene: Scene, folder: str | Path, truth_path: str | Path | None = None, progress: Progress | None = None
 ) -> Truth:
-    """Render `scene` into a new recording folder, and write its truth to an HDF5 file.
+    """`disctrack render SCENE.toml -o RECORDING`: render a scene into a new recording folder, and write its truth.
 
+    scene : or its file
     truth_path : by default truth.h5 in the folder, which recording.toml does not mention
 
     The folder gets its name when it is complete. Raises OutputError if it exists already or cannot be written,
-    SceneError if the scene cannot be rendered.
+    SceneError if the scene cannot be read or rendered.
+
+        >>> truth = run_render("scene.toml", "rendered")
+        >>> len(truth.time)
+        4
     """
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -98,19 +102,6 @@ def write_recording(
                 folder.rmdir()
             part.rename(folder)
     return truth
-
-
-@checked
-def run_render(
-    scene_path: str | Path, folder: str | Path, truth_path: str | Path | None = None, progress: Progress | None = None
-) -> Truth:
-    """`disctrack render SCENE.toml -o RECORDING`: load, render, write; errors as in load_scene and write_recording.
-
-    >>> truth = run_render("scene.toml", "rendered")
-    >>> len(truth.time)
-    4
-    """
-    return write_recording(folder, load_scene(scene_path), truth_path=truth_path, progress=progress)
 
 
 def true_disc_of(scene: Scene) -> Disc:
@@ -149,9 +140,8 @@ def _delay(scene: Scene) -> float:
 def _boards(part: Path, scene: Scene, truth: Truth) -> Iterator[Job]:
     for c, stage in enumerate(stages(truth.rig, scene)):
         for view, (R, t) in enumerate(zip(truth.R_world_board, truth.t_world_board, strict=True)):
-            render = partial(expected_board_image, R, t, stage, scene)
             path = part / "calibration" / stage.name / f"{view:02d}.png"
-            yield path, partial(_exposed, render, scene, [scene.seed, 3, c, view])
+            yield path, partial(expected_board_image, R, t, stage, scene), [scene.seed, 3, c, view]
 
 
 def _frames(part: Path, scene: Scene, pose: PPoly, truth: Truth) -> Iterator[Job]:
@@ -163,12 +153,7 @@ def _frames(part: Path, scene: Scene, pose: PPoly, truth: Truth) -> Iterator[Job
         for i in sorted(set(range(len(truth.time))) - set(missing)):
             around = partial(lambda mid, dt: pose(mid + dt), truth.time[i] + c * _delay(scene))
             render = partial(expected_disc_image, around, exposure, i, stage, scene, drawn)
-            yield part / stage.name / f"{i:06d}.png", partial(_exposed, render, scene, [scene.seed, 4, c, i])
-
-
-def _exposed(render: Callable[[], Array32], scene: Scene, key: list[int]) -> Image:
-    """Image with noise of its own seed, so that it does not depend on the order or the number of threads."""
-    return digitise(render(), scene.sensor, scene.cameras.bit_depth, np.random.default_rng(key))
+            yield part / stage.name / f"{i:06d}.png", render, [scene.seed, 4, c, i]
 
 
 def _write_all(jobs: list[Job], scene: Scene, progress: Progress | None) -> None:
@@ -177,8 +162,9 @@ def _write_all(jobs: list[Job], scene: Scene, progress: Progress | None) -> None
     settings += [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 
     def write(job: Job) -> None:
-        path, take = job
-        if not cv2.imwrite(str(path), take(), settings):
+        path, render, seed = job
+        image = digitise(render(), scene.sensor, scene.cameras.bit_depth, np.random.default_rng(seed))
+        if not cv2.imwrite(str(path), image, settings):
             raise OSError(f"{path} not written")
 
     with ThreadPoolExecutor(max_workers=max(scene.render.threads, 1)) as pool:

@@ -32,7 +32,7 @@ from disctrack.findings import DoubtWarning, Finding, Kind, Severity, finding_fr
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.synthetic.description import CameraSettings, Scene
-from disctrack.synthetic.recording import write_recording
+from disctrack.synthetic.recording import run_render
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_trajectory
 from disctrack.validate.errors import compare
@@ -90,7 +90,7 @@ def untouched(folder: Path, recordings: Sequence[Path], seed: int = 29) -> Itera
     """A rendered recording, and the first pairs of each of these recordings, processed without any fault."""
     scene = rolling_scene(scene_of(seed, quick=True), "rendered", THETA_DEG, PAIRS, np.random.default_rng([seed, 34]))
     scene = scene.changed(cameras={"exposure_s": CameraSettings().exposure_s})
-    yield _ground(folder / scene.name, scene, write_recording(folder / scene.name, scene).q)
+    yield _ground(folder / scene.name, scene, run_render(scene, folder / scene.name).q)
     for path in recordings:
         yield _ground(_first_pairs(read_recording(path), folder), None, None)
 
@@ -190,7 +190,7 @@ def _rendered(fault: Fault, scene: Scene, folder: Path, tree: Tree, size: float)
     """Render the scene with the fault."""
     wrong = _with(fault, size, scene.cameras.frame_rate_hz)
     shutil.rmtree(folder)
-    return write_recording(folder, scene.changed(faults=wrong, board={"n_views": 1})).q
+    return run_render(scene.changed(faults=wrong, board={"n_views": 1}), folder).q
 
 
 def _declared_wrong(fault: Fault, folder: Path, tree: Tree, size: float) -> None:

@@ -23,7 +23,7 @@ from disctrack.frames import CAMERAS, rotation_from_euler
 from disctrack.recording.declaration import read_recording
 from disctrack.synthetic.cameras import all_inside, rig_of
 from disctrack.synthetic.description import GlareSettings, Scene
-from disctrack.synthetic.recording import Truth, write_recording
+from disctrack.synthetic.recording import Truth, run_render
 from disctrack.track.measurement import measure, open_pairs
 from disctrack.track.pose import MIN_DOTS
 from disctrack.trajectory import part
@@ -152,7 +152,7 @@ def render_and_measure(scene: Scene) -> RenderedOutcome:
 
 def render(folder: Path, scene: Scene) -> Truth:
     """Write a recording; an empty pair follows each static pose, so that it is found without a prediction."""
-    truth = write_recording(folder, scene)
+    truth = run_render(scene, folder)
     if scene.motion.kind == "static":
         for camera in CAMERAS:
             reordered(folder / camera, lambda files: [content for file in files for content in (file, b"")])

@@ -12,7 +12,7 @@ import pytest
 
 from disctrack.cli import main
 from disctrack.synthetic import description
-from disctrack.synthetic.recording import write_recording
+from disctrack.synthetic.recording import run_render
 from disctrack.validate.rendered import scene_of
 from tests.oracles import newton_euler
 from tests.oracles.newton_euler import LEAD, of_the_paper
@@ -31,7 +31,7 @@ def hide(folder, scene, body):
     np.save(folder / "motion.npy", np.column_stack([spline.x, spline(spline.x)]))
     motion = description.MotionSettings("table", table="motion.npy")
     scene = replace(scene, motion=motion, folder=folder)
-    write_recording(folder / "recording", scene, truth_path=folder / "elsewhere" / "truth.h5")
+    run_render(scene, folder / "recording", truth_path=folder / "elsewhere" / "truth.h5")
     return folder / "recording"
 
 

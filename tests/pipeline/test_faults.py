@@ -90,7 +90,7 @@ def test_rendering_leaves_a_folder_alone_that_looks_like_a_remainder(tmp_path, m
 
     monkeypatch.setattr(render_recording, "recording_toml", full)
     with pytest.raises(OutputError, match="disk full"):
-        render_recording.write_recording(tmp_path / "take", Scene())
+        render_recording.run_render(Scene(), tmp_path / "take")
     assert contents(tmp_path) == {"take.part/notes.txt": b"mine"}
 
 

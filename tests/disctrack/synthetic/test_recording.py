@@ -22,7 +22,7 @@ from disctrack.synthetic import description
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.motion import motion_of
 from disctrack.synthetic.optics import corner_rays, digitise, sensor_pattern
-from disctrack.synthetic.recording import recording_toml, write_recording
+from disctrack.synthetic.recording import recording_toml, run_render
 from tests.rendering import expected_disc, render_board, render_disc
 
 PLAIN = description.Scene().changed(
@@ -123,7 +123,7 @@ def test_black_squares_lie_where_opencv_projects_them(index, rig):
                 area, centroid = area_and_centroid(cv2_pixels(corners @ R.T + t, rig, index))
                 total, moment = total + area, moment + area * centroid
     mass, found = area_and_centroid(image)
-    assert_allclose(found, moment / total, atol=1e-3)  # 16-bit rounding and 16 x 16 samples at corners: 1e-4 px
+    assert_allclose(found, moment / total, atol=1e-3)  # 16-bit rounding and corners in one cell: 1e-4 px
     assert_allclose(mass / 200, total, rtol=1e-4)
 
 
@@ -349,7 +349,7 @@ def dot_offsets_px(folder, camera_index, expected_px):
 
 @pytest.mark.statistical
 def test_recording_round_trip(scene, tmp_path):
-    truth = write_recording(tmp_path / "r", scene)
+    truth = run_render(scene, tmp_path / "r")
     recording = read_recording(tmp_path / "r")
     assert recording.name == "small"
     assert recording.frame_rate == 1000.0
@@ -376,7 +376,7 @@ def markers_world(q, disc):
 
 
 def test_board_lies_with_the_side_of_dark_corners_on_the_left(scene, tmp_path):
-    truth = write_recording(tmp_path / "r", scene)
+    truth = run_render(scene, tmp_path / "r")
     squares = np.array([[-0.5, -0.5], [-0.5, 5.5], [8.5, -0.5], [8.5, 5.5]]) * 8e-3  # dark, dark, light, light
     points = np.column_stack([squares, np.full(4, 3e-3)])
     for camera, name in enumerate(("left", "right")):
@@ -404,7 +404,7 @@ def test_faults_never_show_in_recording_toml(scene):
 @pytest.mark.statistical
 def test_same_scene_gives_the_same_files_on_any_number_of_threads_and_another_seed_another_rig(scene, tmp_path):
     first, second = (
-        write_recording(tmp_path / name, scene.changed(render={"threads": n})) for name, n in (("a", 1), ("b", 3))
+        run_render(scene.changed(render={"threads": n}), tmp_path / name) for name, n in (("a", 1), ("b", 3))
     )
     assert_array_equal(images(tmp_path / "a", "right"), images(tmp_path / "b", "right"))
     assert_array_equal(first.markers_px, second.markers_px)
@@ -428,7 +428,7 @@ def test_same_scene_gives_the_same_files_on_any_number_of_threads_and_another_se
 )
 def test_images_with_a_fault_show_the_dots_where_the_truth_has_them(scene, tmp_path, faults):
     """Where faults move dots is held against formulas of its own in test_enlarged."""
-    truth = write_recording(tmp_path / "r", replace(scene, faults=faults))
+    truth = run_render(replace(scene, faults=faults), tmp_path / "r")
     for camera, pixels in enumerate(truth.markers_px[0]):
         # perspective shifts a dot's centroid from its centre's image by 0.02 px here, noise by less
         assert np.abs(dot_offsets_px(tmp_path / "r", camera, pixels)).max() < 0.06
@@ -438,7 +438,7 @@ def test_images_with_a_fault_show_the_dots_where_the_truth_has_them(scene, tmp_p
 
 
 def test_wrong_frame_rate_stretches_the_motion(scene, tmp_path):
-    truth = write_recording(tmp_path / "r", replace(scene, faults=Faults(frame_rate_hz=500.0)))
+    truth = run_render(replace(scene, faults=Faults(frame_rate_hz=500.0)), tmp_path / "r")
     assert_allclose(np.diff(truth.time), 2e-3)
     assert_allclose(truth.q[3] - truth.q[0], VELOCITY * 6e-3, atol=1e-12)
     assert read_recording(tmp_path / "r").frame_rate == 1000.0
@@ -448,7 +448,7 @@ def test_wrong_frame_rate_stretches_the_motion(scene, tmp_path):
 def test_hidden_dot_is_paper_and_occluder_is_dark(scene, tmp_path):
     rod = Occluder(camera="right", centre_px=(128.0, 100.0), width_px=10.0, grey=40.0, first_frame=2, last_frame=2)
     faulty = replace(scene, faults=Faults(hidden_markers=(3,), occluders=(rod,)))
-    truth = write_recording(tmp_path / "r", faulty)
+    truth = run_render(faulty, tmp_path / "r")
     u, v = np.rint(truth.markers_px[0, 0, 3]).astype(int)
     assert images(tmp_path / "r", "left")[0, v, u] > 170
     right = images(tmp_path / "r", "right")
@@ -457,7 +457,7 @@ def test_hidden_dot_is_paper_and_occluder_is_dark(scene, tmp_path):
 
 
 def test_missing_frames_have_no_file(scene, tmp_path):
-    write_recording(tmp_path / "r", replace(scene, faults=Faults(right=CameraFault(missing_frames=(1,)))))
+    run_render(replace(scene, faults=Faults(right=CameraFault(missing_frames=(1,)))), tmp_path / "r")
     assert sorted(p.name for p in (tmp_path / "r/right").iterdir()) == ["000000.png", "000002.png", "000003.png"]
     assert len(list((tmp_path / "r/left").iterdir())) == 4
 
@@ -467,12 +467,12 @@ def test_a_render_that_fails_leaves_nothing_behind_and_no_truth_is_replaced(scen
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_recording(tmp_path / "r", scene, progress=stop)
+        run_render(scene, tmp_path / "r", progress=stop)
     assert not (tmp_path / "r").exists()
     assert not (tmp_path / "r.part").exists()
     (tmp_path / "mine.h5").write_text("data")
     with pytest.raises(OutputError, match="exists"):
-        write_recording(tmp_path / "r", scene, truth_path=tmp_path / "mine.h5")
+        run_render(scene, tmp_path / "r", truth_path=tmp_path / "mine.h5")
     assert (tmp_path / "mine.h5").read_text() == "data"
 
 
