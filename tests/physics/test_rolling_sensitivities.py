@@ -210,8 +210,7 @@ def test_a_pulse_of_any_component_moves_the_disc_as_its_sensitivity_says(nutatin
     model, state = nutating
     times = np.linspace(0.0, 0.5, 1001)
     motion, kernel = responses(model, state, times, THETA_END)
-    course = np.exp(-0.5 * ((times - 0.2) / width) ** 2)
-    wrenches = course[:, None, None] * np.eye(len(COMPONENTS))
+    wrenches = np.exp(-0.5 * ((times - 0.2) / width) ** 2)[:, None, None] * np.eye(len(COMPONENTS))
     by_start = sensitivities(model, state, times, (), None, THETA_END).dq
     moved = by_start @ moved_start(motion.time, kernel, wrenches)
     probe = effect_from_formulas("pulse", {c: f"of_{c} * exp(-((time - 0.2) / {width})**2 / 2)" for c in COMPONENTS})

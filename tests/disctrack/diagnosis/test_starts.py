@@ -1,6 +1,5 @@
 """Recordings that hold more than rolling, and laboratories that are not ideal, by a little or by degrees."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -96,11 +95,9 @@ def test_slip_at_the_start_is_found_with_its_friction_and_its_end():
 @pytest.mark.statistical
 @pytest.mark.parametrize("n", [300, pytest.param(900, marks=pytest.mark.slow)])
 def test_slip_of_a_millimetre_per_second_at_the_first_frame_is_found(n):
-    """Friction below what rolling needs: no velocity shows the slip; 900 frames slip seven times, within 1e6 steps."""
+    """Friction below what rolling needs: no velocity shows the slip; 900 frames slip seven times, within a trial."""
     trajectory = measured({"slip.mu": 0.06}, seed=100, n=n, theta_deg=20.0)
-    began = time.process_time()
     result = diagnose(trajectory)
-    assert time.process_time() - began < 60.0  # 3 and 13 s were measured
     assert [f.candidate.name for f in result.diagnosis.found] == ["slip_start"]
     assert result.after.reduced_chi_square < 1.03 < 1000 < result.before.reduced_chi_square
     assert_sized(result.diagnosis.after, {"slip.inverse_mu": 1 / 0.06}, 4, 4 * 0.002 / 0.06)
