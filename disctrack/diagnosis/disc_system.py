@@ -39,7 +39,7 @@ from disctrack.track.refine.table_contact import ASSUMED_THICKNESS as MICROMETER
 from disctrack.track.refine.table_contact import thickness_tolerance
 from disctrack.trajectory import MarkerStatus, Trajectory
 
-RTOL = 1e-9  # of the integration: a ten-thousandth of the noise
+RTOL = 1e-10  # of the integration: a millionth of the noise
 MIN_NUISANCE = 0.1  # sigmas by which a direction of the rig's covariance moves all dots together at least
 MAX_SWITCHES = (50, 200)  # and per second: slip at every extremum of a nutation of 30 Hz has 120; more is chatter
 # creep at small slip is stiff: its time constant is v / (3 mu g), and steps of the integrator have to be as short

@@ -15,7 +15,7 @@ from calibration.kit.arrays import Array, Numbers
 from calibration.kit.compiled import exact_part, njit
 from disctrack.rolling._compiled import call
 
-RTOL_IMAGINARY = 1e-6  # fifth-order error per step; the relative error of the derivatives is then about 1e-8
+RTOL_IMAGINARY = 1e-7  # fifth-order error per step; the relative error of the derivatives is then about 1e-9
 
 
 class CompiledSystem(NamedTuple):

@@ -180,7 +180,7 @@ def _expected_significance(result: DiscDiagnosis, truths: Sequence[Values], plan
     """Significance of the weakest planted effect in the joint model, and that required for a claim, in sigmas.
 
     From the Fisher information at the truth: the decrease of chi-square is a' C^-1 a for amounts a with covariance C,
-    with all other quantities fitted. NaN if the joint fit does not converge, or the catalogue lacks an effect.
+    with all other quantities fitted. NaN without a prediction, or if the catalogue lacks an effect.
     """
     system, d = result.system, result.diagnosis
     own = [candidate for truth in truths for candidate in system.candidates if set(truth) <= set(candidate.names)]
@@ -188,7 +188,7 @@ def _expected_significance(result: DiscDiagnosis, truths: Sequence[Values], plan
         return np.nan, np.nan
     quantities = {q.name: q for q in (*system.base, *(q for candidate in own for q in candidate.quantities))}
     joint = fit(system, tuple(quantities.values()), d.before.values | planted)
-    if not joint.converged:
+    if not np.isfinite(joint.cost):
         return np.nan, np.nan
     found = []
     for truth, candidate in zip(truths, own, strict=True):
