@@ -19,7 +19,7 @@ from disctrack.errors import AnalysisError
 
 TOLERANCE = 1e-10  # of a step, relative to the size of a state
 MAX_STEPS = 400_000  # limit of an integration ...
-HARDER = 50  # ... and over the steps of the motion before a fit's step: a motion so much harder is rejected
+HARDER = 10  # ... and over the steps of the motion before a fit's step: a motion so much harder is rejected
 MOST_WORK = 2e8  # of an answer: steps of the integrator times states and sensitivities, some 1 us each ...
 OF_ONE = 0.1  # ... and share of it for one trial
 MOST_STATES = 80  # initial states that are fitted together: further stretches add little
