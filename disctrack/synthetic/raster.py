@@ -6,8 +6,7 @@ So light is additive: every shape adds its step of grey times the area of a cell
 
 A pixel without an edge is covered or not. A pixel with an edge is divided into s x s cells. The covered area of a cell
 follows from signed distances at its corners and its centre. Area and first moments are exact for a straight edge, and
-corrected for curvature to second order. The error of a blurred edge is of third order in the size of the cells; that
-of a right angle, which one cell rounds off, moves the corner of a square by 3e-5 px.
+corrected for curvature to second order. The error of a blurred edge is of third order in the size of the cells.
 """
 
 import numpy as np
@@ -21,6 +20,8 @@ _ROUND, _BODY, _SHEET = 0.0, 1.0, 2.0
 _FAR = -1e3  # [m] signed distance of a ray that does not meet the plane in front of the camera
 _CLEAR, _CLEAR_OF_TIPS = 0.6, 1.0  # mean distance over the range at a pixel's corners, above which no edge crosses it:
 # 1/2 for a straight edge, 1 for a right angle that enters between two of the corners
+_BENT = 0.02  # difference of centre and mean of the corners over their range, above which the edge has a corner
+_SAMPLES = 16  # per side, of a cell with such a corner
 
 
 def round_shape(height: float, centre: tuple[float, float], radius: float, within: float) -> Array:
@@ -150,9 +151,18 @@ def _add_crossed(
             f[0, j], f[1, j] = f[1, j], _at(rays, row, column, (i + 1) / s, j / s, R, eye, shape)
         for j in range(s if i >= 0 else 0):
             a, b, c, d = f[0, j], f[0, j + 1], f[1, j], f[1, j + 1]
+            mean, spread = 0.25 * (a + b + c + d), max(max(a, b), max(c, d)) - min(min(a, b), min(c, d))
             middle = _at(rays, row, column, (i + 0.5) / s, (j + 0.5) / s, R, eye, shape)
-            middle += (0.25 * (a + b + c + d) - middle) / 3.0
-            area, m_x, m_y = half_plane(middle, 0.5 * (b + d - a - c), 0.5 * (c + d - a - b))
+            if abs(mean) < spread and abs(middle - mean) > _BENT * spread:
+                area = m_x = m_y = 0.0
+                for k in range(_SAMPLES * _SAMPLES):
+                    p, q = (k // _SAMPLES + 0.5) / _SAMPLES, (k % _SAMPLES + 0.5) / _SAMPLES
+                    if _at(rays, row, column, (i + p) / s, (j + q) / s, R, eye, shape) > 0.0:
+                        area, m_x, m_y = area + 1.0, m_x + q - 0.5, m_y + p - 0.5
+                area, m_x, m_y = area / _SAMPLES**2, m_x / _SAMPLES**2, m_y / _SAMPLES**2
+            else:
+                middle += (mean - middle) / 3.0
+                area, m_x, m_y = half_plane(middle, 0.5 * (b + d - a - c), 0.5 * (c + d - a - b))
             _deposit(cells, row * s + i, column * s + j, step * area, step * m_x, step * m_y)
 
 

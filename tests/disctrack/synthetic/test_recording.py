@@ -123,7 +123,7 @@ def test_black_squares_lie_where_opencv_projects_them(index, rig):
                 area, centroid = area_and_centroid(cv2_pixels(corners @ R.T + t, rig, index))
                 total, moment = total + area, moment + area * centroid
     mass, found = area_and_centroid(image)
-    assert_allclose(found, moment / total, atol=1e-3)  # 16-bit rounding and corners in one cell: 1e-4 px
+    assert_allclose(found, moment / total, atol=1e-3)  # 16-bit rounding and 16 x 16 samples at corners: 1e-4 px
     assert_allclose(mass / 200, total, rtol=1e-4)
 
 
