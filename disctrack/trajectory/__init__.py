@@ -185,6 +185,8 @@ def at_full_length(part: Trajectory, n: int, start: int, timestamps: Array | Non
 
     timestamps (n,) [s] if the camera wrote them; otherwise frames are evenly spaced.
     """
+    if len(part) == n:
+        return part
     time = np.arange(n) / part.frame_rate if timestamps is None else np.array(timestamps, float)
     time[start : start + len(part)] = part.time
     whole = _changed(part, lambda name, value: among(n, start, value, _FILL.get(name)))

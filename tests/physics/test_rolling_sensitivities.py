@@ -218,8 +218,7 @@ def test_a_pulse_of_any_component_moves_the_disc_as_its_sensitivity_says(nutatin
     probed = model.knowing(probe).with_values(dict.fromkeys(names, 0.0))
     found = sensitivities(probed, state, times, names, (), THETA_END)
     # the integral is of fourth order in 0.5 ms over the width; the derivatives hold to 1e-9
-    tolerance = 2.5 * (5e-4 / width) ** 4
-    assert (np.abs(moved - found.dq).max(axis=0) < tolerance * np.abs(found.dq).max(axis=0)).all()
+    assert (np.abs(moved - found.dq).max(axis=0) < 2.5 * (5e-4 / width) ** 4 * np.abs(found.dq).max(axis=0)).all()
     # the tail of a pulse, from 1e-300 of its height on, takes no steps: four times as many for the short one if it does
     assert found.n_steps < 200 * (1 + len(names))
 

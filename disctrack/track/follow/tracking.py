@@ -150,8 +150,9 @@ def _conflicts(tracking: Measurement, noticed: tuple[Finding, ...], read_blocks:
     status = tracking.trajectory.frame_status
     contradicted = Kind.ONE_SIDED in kinds or 2 * np.sum(status == FrameStatus.CONTRADICTED) > len(status)
     far = _faulty(noticed) and max(tracking.details["systematic_px"]) > MEETING_PX
-    unexplained = (contradicted or far) and Kind.DROPPED_FRAMES not in kinds  # these explain a contradiction
-    rows = np.flatnonzero(unexplained & (_apart(tracking) | (far & (status == FrameStatus.MEASURED))))
+    if not (contradicted or far) or Kind.DROPPED_FRAMES in kinds:  # dropped frames explain the contradiction
+        return _some(read_blocks, pairs[:0])
+    rows = np.flatnonzero(_apart(tracking) | (far & (status == FrameStatus.MEASURED)))
     return _some(read_blocks, pairs[rows[0] :] if len(rows) else pairs[:0])
 
 

@@ -98,6 +98,7 @@ def test_slip_of_a_millimetre_per_second_at_the_first_frame_is_found(n):
     """Friction below what rolling needs: no velocity shows the slip; 900 frames slip seven times, within a trial."""
     trajectory = measured({"slip.mu": 0.06}, seed=100, n=n, theta_deg=20.0)
     result = diagnose(trajectory)
+    assert result.system.budget.open(kept=0.5)  # not half of the work is needed
     assert [f.candidate.name for f in result.diagnosis.found] == ["slip_start"]
     assert result.after.reduced_chi_square < 1.03 < 1000 < result.before.reduced_chi_square
     assert_sized(result.diagnosis.after, {"slip.inverse_mu": 1 / 0.06}, 4, 4 * 0.002 / 0.06)
