@@ -210,8 +210,8 @@ class _Problem:
 
 def no_fit(quantities: Sequence[Quantity], values: Values) -> Fit:
     """A fit without a result, worse than any other."""
-    k = sum(not q.slot for q in quantities)
-    return Fit(tuple(quantities), dict(values), np.zeros((k, k)), np.inf, 0.0, 0, False, 0)
+    k, held = sum(not q.slot for q in quantities), {q.name: q.null for q in quantities} | dict(values)
+    return Fit(tuple(quantities), held, np.zeros((k, k)), np.inf, 0.0, 0, False, 0)
 
 
 def _joint(covariance: Array, common: Projection, derivative: Array) -> Array:
