@@ -11,7 +11,7 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from calibration.kit.arrays import Numbers
-from calibration.kit.compiled import exact_part
+from calibration.kit.compiled import exact_part, owning_part
 
 N = DOP853.n_stages  # 12; stage 12 is the rate at the end of the step, stages 13 to 15 are for the dense output
 A = np.zeros((N + 4, N + 4))
@@ -30,7 +30,7 @@ class Step(NamedTuple):
     end: Numbers  # (n,) ... the state at the end of the step
 
 
-@exact_part
+@owning_part
 def room(y: Numbers, width: int) -> Step:
     """Work arrays for states (n,) if the function of rates writes `width` numbers."""
     return Step(np.zeros((N + 4, width), y.dtype), np.zeros((7, y.size), y.dtype), y.copy(), y.copy())

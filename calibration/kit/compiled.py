@@ -28,8 +28,10 @@ RULES: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"co
 # Called from compiled code, always inlined: otherwise two copies (its own and its caller's) may be optimised
 # differently, and which of them runs would depend on whether the code was just compiled or loaded.
 part: Any = njit(**RULES, no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)
-# Called from compiled code, without fast rules and not forced inline: for integrations over thousands of steps.
-exact_part = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+# Called from compiled code, without fast rules and not forced inline: for integrations over thousands of steps. If a
+# function creates no array, references to its arguments are not counted: that took most of the time (numba issue 2345).
+owning_part = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+exact_part = njit(error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
 
 WITH_COMPILED = (
     "calibration/kit/compiled.py",

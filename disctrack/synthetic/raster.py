@@ -13,8 +13,7 @@ import numpy as np
 from numba import types
 
 from calibration.kit.arrays import Array, Array32
-from calibration.kit.compiled import exact_part as part
-from calibration.kit.compiled import njit
+from calibration.kit.compiled import exact_part, njit, owning_part
 
 _ROUND, _BODY, _SHEET = 0.0, 1.0, 2.0
 _FAR = -1e3  # [m] signed distance of a ray that does not meet the plane in front of the camera
@@ -42,7 +41,7 @@ def sheet_shape(x: tuple[float, float], y: tuple[float, float], bow: tuple[float
     return np.array([_SHEET, *x, *y, *bow])
 
 
-@part
+@exact_part
 def half_plane(f0: float, a: float, b: float) -> tuple[float, float, float]:
     """Area and first moments (in x, in y) of the part of the square [-1/2, 1/2]^2 on which f0 + a x + b y > 0.
 
@@ -72,7 +71,7 @@ def half_plane(f0: float, a: float, b: float) -> tuple[float, float, float]:
     return area, m if a > 0.0 else -m, n if b > 0.0 else -n
 
 
-@part
+@exact_part
 def between(grid: Array, row: int, column: int, p: float, q: float, k: int) -> float:
     """Bilinear value of component k at row + p, column + q."""
     upper = (1 - q) * grid[row, column, k] + q * grid[row, column + 1, k]
@@ -80,7 +79,7 @@ def between(grid: Array, row: int, column: int, p: float, q: float, k: int) -> f
     return (1 - p) * upper + p * lower
 
 
-@part
+@exact_part
 def _foot(eye: Array, dx: float, dy: float, dz: float, height: float) -> tuple[float, float, bool]:
     """Point (x, y) of the ray eye + t d in the plane z = height, and whether t > 0."""
     if dz == 0.0:
@@ -89,7 +88,7 @@ def _foot(eye: Array, dx: float, dy: float, dz: float, height: float) -> tuple[f
     return eye[0] + t * dx, eye[1] + t * dy, t > 0.0
 
 
-@part
+@exact_part
 def _distance(rx: float, ry: float, R: Array, eye: Array, shape: Array) -> float:
     """Signed distance [m] of the ray (rx, ry, 1) of the camera from the edge of a shape, positive inside."""
     dx = R[0, 0] * rx + R[1, 0] * ry + R[2, 0]
@@ -119,13 +118,13 @@ def _distance(rx: float, ry: float, R: Array, eye: Array, shape: Array) -> float
     return found
 
 
-@part
+@exact_part
 def _at(rays: Array, row: int, column: int, p: float, q: float, R: Array, eye: Array, shape: Array) -> float:
     """`_distance` at row fraction p, column fraction q of a pixel."""
     return _distance(between(rays, row, column, p, q, 0), between(rays, row, column, p, q, 1), R, eye, shape)
 
 
-@part
+@exact_part
 def _deposit(cells: Array32, y: int, x: int, value: float, moment_x: float, moment_y: float) -> None:
     """Add light to a cell and its first moments to the neighbours.
 
@@ -140,7 +139,7 @@ def _deposit(cells: Array32, y: int, x: int, value: float, moment_x: float, mome
         cells[y + 1, x] += 0.5 * moment_y
 
 
-@part
+@owning_part
 def _add_crossed(
     cells: Array32, step: float, s: int, row: int, column: int, rays: Array, R: Array, eye: Array, shape: Array
 ) -> None:  # fmt: skip

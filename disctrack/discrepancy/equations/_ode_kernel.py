@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calibration.kit import _dop853 as dop853
 from calibration.kit.arrays import Array
-from calibration.kit.compiled import exact_part, njit
+from calibration.kit.compiled import exact_part, njit, owning_part
 
 _f, _v, _m, _cube = types.float64, types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
 # rhs(t, y, p, u, u_rate, f, J, P): f (n,), J = df/dy (n, n), P = df/dp (n, n_p) are filled in
@@ -62,7 +62,7 @@ class _Drive(NamedTuple):
     P: Array
 
 
-@exact_part
+@owning_part
 def _drive(p, columns, n, knots, pieces):
     u, u_rate = np.zeros(len(pieces)), np.zeros(len(pieces))
     piece = np.zeros(1, np.int64)
@@ -145,7 +145,7 @@ def _error(step, K, new, size, largest, tolerance, to_come):
     return worst
 
 
-@exact_part
+@owning_part
 def _solve(M, b):
     """Replace b (m, k) by M^-1 b; False where M has no inverse."""
     try:
@@ -155,7 +155,7 @@ def _solve(M, b):
     return True
 
 
-@exact_part
+@owning_part
 def _stages(rhs, t, step, z, Z, drive, F, J, P, M, left):
     """Negative residuals of the stage equations for stages z + Z (3 n, 1), and their Jacobian M (3 n, 3 n)."""
     n = len(drive.f)
@@ -174,7 +174,7 @@ def _stages(rhs, t, step, z, Z, drive, F, J, P, M, left):
             M[row, row] += 1.0
 
 
-@exact_part
+@owning_part
 def _implicit_step(rhs, t, step, z, drive, slope, size, W):
     """Increments of states and sensitivities at the stages, W (3, len(z)), and the error over its tolerance.
 
@@ -222,7 +222,7 @@ def _implicit_step(rhs, t, step, z, drive, slope, size, W):
     return worst
 
 
-@exact_part
+@owning_part
 def _along_stages(W, z, x, out):
     """Collocation polynomial of the implicit step at the fraction x of it."""
     part = x * (_RADAU_Q[0] + x * (_RADAU_Q[1] + x * _RADAU_Q[2]))
