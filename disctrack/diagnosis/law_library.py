@@ -294,16 +294,16 @@ def _instants(time: Array) -> Iterator[Row]:
 
     A blow is a Gaussian, or a half sine as of a soft hammer (IEC 60068-2-27): real ones lie between these.
     """
-    after = "(0.5 + 0.5 * sign(time - {instant}, 0.002))"
+    after = "(0.5 + 0.5 * sign(time - {instant}, {lasting}))"
     bell = "exp(-0.5 * ((time - {instant}) / {lasting}) ** 2) / (2.5066283 * {lasting})"
     phase = "((time - {instant}) / (4.0 * {lasting}))"
     within = f"(0.5 + 0.5 * sign(0.25 - {phase} * {phase}, 1e-3))"
     half_wave = f"{within} * cos(3.14159265 * {phase}) * 0.39269908 / {{lasting}}"
     few, many = (np.interp(np.linspace(0.03, 0.97, n), (0, 1), time[[0, -1]]).tolist() for n in (32, 64))
-    begins = [{"instant": instant} for instant in few]
+    begins = [{"instant": instant, "lasting": 0.002} for instant in few]
     yield "a force from an instant on", "from then on", _push(after), begins
     for axis in MOMENTS:
-        yield f"a moment M_{axis} from an instant on", "from then on", ({f"M_{axis}": after},), begins
+        yield f"a moment M_{axis} by the load from an instant on", "from then on", ({f"load_{axis}": after},), begins
     blows = [{"instant": instant, "lasting": 0.008} for instant in many]
     for words, blow in (("", bell), (HALF, half_wave)):
         yield f"a blow{words}: a force during milliseconds", f"blow{words}", _push(blow), blows

@@ -124,8 +124,8 @@ def _worth_a_refit(
     """
     left = {id(g): (chi_square - g.gain) / noise for g in worth}
     if np.isfinite(against):
-        beyond = COARSE * max(chi_square / noise - against, 0.0)
-        worth = [g for g in worth if left[id(g)] < against + NEARLY + beyond * bool(g.family.shape)]
+        beyond = max(chi_square / noise - against, 0.0)
+        worth = [g for g in worth if left[id(g)] < against + NEARLY + (COARSE if g.family.shape else EXACT) * beyond]
 
     def rank(g: Gain) -> tuple[float, float]:
         return price * g.family.n_numbers + max(left[id(g)], EXACT * inexact / noise), left[id(g)]

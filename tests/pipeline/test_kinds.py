@@ -67,10 +67,6 @@ def stacked(**attributes) -> Plant:
     return plant
 
 
-def no_mass(folder, tree):
-    del tree["disc"]["mass_g"]
-
-
 def exchanged_with_the_views(folder, tree):
     for section in ("cameras", "calibration"):
         tree[section]["left"], tree[section]["right"] = tree[section]["right"], tree[section]["left"]
@@ -139,7 +135,8 @@ def hidden_once(image, share):
 DOTS = [[26.0, 0.0], [13.0, 22.5167], [-13.0, 22.5167], [-26.0, 0.0], [-13.0, -22.5167], [6.5, -11.2583]]
 FAULTS = {
     # what is declared
-    "a key is missing": fault(Kind.DECLARATION, "refusal", "mass_g is missing", no_mass),
+    "a key is missing": fault(Kind.DECLARATION, "refusal", "mass_g is missing",
+                              lambda _, tree: tree["disc"].pop("mass_g")),
     "wrong square": fault(Kind.SQUARE, "doubt", "square_mm: 6.00 would fit (declared 6.1)",
                           says("calibration", square_mm=6.1)),
     "squares of 10": fault(Kind.SQUARE, "doubt", "square_mm: 6.00 would fit (declared 10)",

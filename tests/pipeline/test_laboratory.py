@@ -48,10 +48,6 @@ def test_errors_are_as_large_as_stated(name):
     assert np.all(rms < most_um), rms
 
 
-def rotation_drag(disc, now):
-    return -2.5e-6 * now.omega, ZERO, ZERO
-
-
 TILT = np.radians(0.1)
 PLANTED = {  # the body with its laws, and what the diagnosis calls that, with the true sizes
     "none": (of_the_paper(), {}),
@@ -62,7 +58,7 @@ PLANTED = {  # the body with its laws, and what the diagnosis calls that, with t
     "kz": (of_the_paper(pivoting_friction(30e-6)), {"kz.k_z": 30e-6}),
     "com": (of_the_paper(com_body=(50e-6, 0.0, 0.0)), {"centre_of_mass.c_1": 50e-6, "centre_of_mass.c_2": 0.0}),
     "rolling": (of_the_paper(classical_rolling_friction(30e-6)), {"rolling_classical.delta": 30e-6}),
-    "drag": (of_the_paper(rotation_drag), {"drag_rotation.c": 2.5e-6}),
+    "drag": (of_the_paper(lambda disc, now: (-2.5e-6 * now.omega, ZERO, ZERO)), {"drag_rotation.c": 2.5e-6}),
 }
 
 

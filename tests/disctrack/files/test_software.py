@@ -80,9 +80,7 @@ def test_every_file_with_a_compiled_loop_that_is_kept_counts_for_what_is_kept():
 
 def test_a_read_only_home_and_installation_get_a_cache_of_their_own(monkeypatch, tmp_path):
     monkeypatch.setattr(compiled.config, "CACHE_DIR", "")
-    assert (
-        compiled._folder().parent == Path(compiled.__file__).parent / "__pycache__"
-    )  # this checkout can be written to
+    assert compiled._folder().parent == Path(compiled.__file__).parent / "__pycache__"  # which can be written to
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path).is_relative_to(tmp_path))
     folder = compiled._folder().parent
