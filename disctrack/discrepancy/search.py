@@ -628,7 +628,7 @@ class _Search:
         near = [c for c in near if strength * np.sin(angles[c.name]) ** 2 < 4 * CLASS_GAIN + 0.02 * strength]
         near = near[: MOST_ALTERNATIVES if strength < FAINT else MOST_ALTERNATIVES // 2]
         found = []
-        for candidate in near:
+        for candidate in near if self.system.budget.open(kept=FOR_LAWS) else ():
             other = self._explanation((*rest, candidate), start, (candidate,))
             loss = (other.fit.cost - e.fit.cost) / self.noise
             if other.fit.converged and loss < CLASS_GAIN:
