@@ -136,10 +136,10 @@ def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():
 
 
 def test_a_law_may_miss_the_noise_by_the_error_of_its_first_order():
-    """Where what it replaces is worth 1e6, a response that is right to a hundredth leaves a hundred; nobody a half."""
-    one = Family("a force", ({"X_n": "1.0"},))
+    """That is a fiftieth of what the law is to explain, as its rank among others allows for, and no more."""
+    laws = {left: Family("a force", ({"X_n": "1.0"},), kind=str(left)) for left in (8100.0, 2.7e4, 2.9e4)}
     for chi_square, n in ((1e6, 2), (9.2e3, 1)):  # near the noise, the first order is exact
-        gains = [Gain(one, chi_square - left, np.ones(1)) for left in (8100.0, 9000.0, 5e5)]
+        gains = [Gain(family, chi_square - left, np.ones(1)) for left, family in laws.items()]
         assert _worth_a_refit(gains, chi_square, 8100.0, 1.0, 9.0, 8100.0) == gains[:n]
 
 
@@ -147,8 +147,7 @@ def test_a_law_may_miss_the_noise_by_the_error_of_its_first_order():
 def test_far_from_the_data_a_law_whose_first_term_describes_little_has_no_other():
     """A disc that slips on ice: no law of a rolling disc describes that, and three would take minutes."""
     system, base = with_base_fit(recording("low_friction").trajectory)
-    law = learn(system, base, 1.0)
-    assert len(law.families) == 1
+    assert len(learn(system, base, 1.0).families) == 1
 
 
 @pytest.mark.statistical
@@ -313,7 +312,7 @@ def test_a_blow_is_an_impulse_at_an_instant():
 @pytest.mark.parametrize(
     ("name", "title", "sizes"),
     [  # known effects come near the first, and leave a memory of p = 1e-80; four of them leave noise of the second
-        ("growing_force", "a level force that changes with time, degree 1", {"c_0_2": 4.2e-4, "c_0_3": -1.33e-3}),
+        ("growing_force", "a level force that changes with time, degree 1", {"c_0_2": 1.2e-3, "c_0_3": -3.8e-3}),
         ("cross_drag", "a force X_n by psidot sin theta", {"c_0": 6e-4}),
         ("friction_steps", "a moment M_m by the load from an instant on", {"instant_0": 0.348}),
         ("seam", "a step of the table", {"c_0": 6e-6, "direction_0": 0.9, "edge_0": 0.045}),
@@ -322,11 +321,15 @@ def test_a_blow_is_an_impulse_at_an_instant():
     ],
 )
 def test_a_law_of_one_term_is_named_with_its_size(name, title, sizes):
-    """A force over time is about its middle, 0.35 s from both ends; frames begin 2 ms after the motion."""
+    """A force that grows, in N/s, is told by its size half the time from its middle; frames begin at 2 ms."""
     result = diagnose(recording(name).trajectory)
-    assert result.after.reduced_chi_square < 1.05
-    assert (result.learned.law.title, result.diagnosis.found) == (title, ())
-    assert_sized(result.diagnosis.after, {f"learned.{part}": size for part, size in sizes.items()}, 3)
+    diagnosis, time = result.diagnosis, result.system.time
+    assert result.after.reduced_chi_square < (1.0 if name == "groove" else 1.05)
+    assert (result.learned.law.title, diagnosis.found, diagnosis.verdict) == (title, (), "unexplained")
+    assert np.isfinite(result.learned.course.sigma).all()  # of a step wider than any hill: derivatives inwards
+    assert name != "groove" or ("table_tilt",) in [e.effects for e in diagnosis.ranked]
+    unit = 0.5 * (time[-1] - time[0]) if name == "growing_force" else 1.0
+    assert_sized(diagnosis.after, {f"learned.{part}": unit * size for part, size in sizes.items()}, 3)
 
 
 @pytest.mark.slow

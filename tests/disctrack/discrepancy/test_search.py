@@ -217,8 +217,7 @@ def test_a_hypothesis_that_takes_too_long_is_left_and_the_others_are_tried(rng):
     answer = explain(impatient, START)  # the twin of the drift does what the drift did
     assert sorted(f.candidate.name for f in answer.found) == ["hum", "twin"]
     assert not any(r.candidate.name == "drift" for f in answer.found for r in f.cannot_be_told_from)
-    drift = Quantity("drift", "1", 0.1)
-    assert attempt(impatient, (*impatient.base, drift), START).values == START | {"drift": 0.0}
+    assert attempt(impatient, (*impatient.base, Quantity("drift", "1", 0.1)), START).values == START | {"drift": 0.0}
 
 
 def test_when_the_work_is_used_up_nothing_more_is_put_forward(rng):
