@@ -12,18 +12,9 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
+from disctrack.diagnosis import motion
 from disctrack.diagnosis.law_library import LearnedLaw
 from disctrack.diagnosis.missing_force import DiscScan, response
-from disctrack.diagnosis.motion import (
-    SLIP,
-    THETA_END,
-    measurement_candidates,
-    model_quantities,
-    motion_candidates,
-    slip_start,
-    state_of,
-    state_quantities,
-)
 from disctrack.diagnosis.starts import STRETCHES, shape_guesses, start_values
 from disctrack.diagnosis.stretch import free_stretch
 from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, field_columns
@@ -102,9 +93,9 @@ class DiscSystem(System):
         self.trial_work = TRIAL_WORK * len(self.time)
         self.budget = Budget(MOST_WORK * max(len(self.time), USUAL))
         if candidates is None:
-            candidates = (*motion_candidates(model), *measurement_candidates(self.disc))
-        self.slips, of_slip = slips, slip_start(model).quantities if slips else ()
-        fitted = (*state_quantities(), *model_quantities(model), *of_slip)
+            candidates = (*motion.motion_candidates(model), *motion.measurement_candidates(self.disc))
+        self.slips, of_slip = slips, motion.slip_start(model).quantities if slips else ()
+        fitted = (*motion.state_quantities(), *motion.model_quantities(model), *of_slip)
         sizes = tuple(self._sizes({q.name for q in fitted}))
         # a table determined from the rim has its own plane in each recording, which is no fault
         in_base = {q.name for q in (*of_slip, *(q for q in sizes if not q.belongs_to))}
@@ -124,9 +115,9 @@ class DiscSystem(System):
         sizes = {"contact_radius.r_error": radius, "contact_height.h_error": half, "pattern_height.offset": half}
         height, slope_x, slope_y = self.trajectory.table_moved
         sizes |= {"table_height.offset": height, "table_plane.tilt_x": slope_y, "table_plane.tilt_y": slope_x}
-        of_motion = motion_candidates(self.model, ("contact_radius", "contact_height"))
+        of_motion = motion.motion_candidates(self.model, ("contact_radius", "contact_height"))
         of_table = ("table_height", "table_plane")
-        faults = measurement_candidates(self.disc, ("pattern_height", *of_table))
+        faults = motion.measurement_candidates(self.disc, ("pattern_height", *of_table))
         for candidate in (*of_motion, *faults):
             for q in candidate.quantities:
                 sigma, most = sizes[q.name], MOST_SIGMAS * sizes[q.name]
@@ -250,8 +241,8 @@ class DiscSystem(System):
     def model_with(self, values: Values) -> Model:
         """The model with every effect that has an amount in `values`."""
         effects = {name: v for name, v in values.items() if self.model.has_name(name)}
-        if values.get(SLIP, 0.0) > 0:
-            effects["slip.mu"] = 1.0 / values[SLIP]
+        if values.get(motion.SLIP, 0.0) > 0:
+            effects["slip.mu"] = 1.0 / values[motion.SLIP]
         return self.model.with_values(effects)
 
     def starts(self, candidate: Candidate, values: Values, least: float = 0.0) -> Sequence[tuple[float, ...]]:
@@ -261,9 +252,9 @@ class DiscSystem(System):
         """
         if not candidate.threshold:
             return shape_guesses(self, candidate, values, least)
-        motion = simulate(self.model_with(values), state_of(values), times=self.instants(values))
-        tried = 1.0 / (np.array(SLIP_STARTS) * np.max(motion.friction_needed))
-        chi_squares = [np.sum(self.linearise({**values, SLIP: inverse}, [])[0] ** 2) for inverse in tried]
+        rolled = simulate(self.model_with(values), motion.state_of(values), times=self.instants(values))
+        tried = 1.0 / (np.array(SLIP_STARTS) * np.max(rolled.friction_needed))
+        chi_squares = [np.sum(self.linearise({**values, motion.SLIP: inverse}, [])[0] ** 2) for inverse in tried]
         return [(float(tried[np.argmin(np.nan_to_num(chi_squares, nan=np.inf))]),)]
 
     def instants(self, values: Values) -> Array:
@@ -366,28 +357,30 @@ class DiscSystem(System):
         if self.measured is not None:
             return self.measured, (), still
         times, delay = self.instants(values), scene_faults(self.disc, values).right_delay_s
-        model, state = self.model_with({k: v for k, v in values.items() if np.isfinite(v)}), state_of(values)
+        model, state = self.model_with({k: v for k, v in values.items() if np.isfinite(v)}), motion.state_of(values)
         # a step of the fit may lead to states in which no disc rolls, or whose integration does not end
-        fastest = 3 * np.sqrt(4 * model.gravity / (self.disc.radius * np.sin(THETA_END)))
-        nowhere = not THETA_END < state.theta <= np.pi / 2 or max(abs(state.psidot), abs(state.omega3)) > fastest
+        fastest = 3 * np.sqrt(4 * model.gravity / (self.disc.radius * np.sin(motion.THETA_END)))
+        nowhere = not motion.THETA_END < state.theta <= np.pi / 2 or max(abs(state.psidot), abs(state.omega3)) > fastest
         if nowhere or (self.slips and model.effect("slip") is None):  # 1/mu = 0: no velocity is free
             nothing = np.full((2, len(times), 6), np.nan)
             return (nothing, nothing), (), still
         components = [n for n in names if n.startswith("state.")]
         parameters = {n: n for n in names if model.has_name(n) and np.isfinite(values.get(n, 0.0))}
-        if SLIP in names and values.get(SLIP, 0.0) > 0:
-            parameters[SLIP] = "slip.mu"
+        if motion.SLIP in names and values.get(motion.SLIP, 0.0) > 0:
+            parameters[motion.SLIP] = "slip.mu"
         limit = int(MAX_SWITCHES[0] + MAX_SWITCHES[1] * (times[-1] - times[0]))
         rolls = model.effect("slip") is None and model.effect("creep") is None
         # a motion that needs more steps is given up
         left = int(min(self.budget.trial_left, self.trial_work * (ROLLS if rolls else 1.0)))
         of_state = [n.partition(".")[2] for n in components]
-        moving = sensitivities(model, state, times, tuple(parameters.values()), of_state, THETA_END, RTOL, limit, left)
+        moving = sensitivities(
+            model, state, times, tuple(parameters.values()), of_state, motion.THETA_END, RTOL, limit, left
+        )
         self.budget.work(moving.n_steps)
         by_motion, moved = moving.dq.copy(), (*components, *parameters)
         by_motion[:, 3:] = euler_rate_axes_world(moving.q[:, 3], moving.q[:, 4]) @ moving.dq[:, 3:]
-        if SLIP in parameters:
-            by_motion[..., moved.index(SLIP)] *= -1.0 / values[SLIP] ** 2
+        if motion.SLIP in parameters:
+            by_motion[..., moved.index(motion.SLIP)] *= -1.0 / values[motion.SLIP] ** 2
         q, qdot = np.stack([moving.q] * 2), np.stack([moving.qdot] * 2)
         if delay and np.isfinite(moving.q).all():
             spline = CubicHermiteSpline(times, moving.q, moving.qdot)

@@ -166,9 +166,8 @@ def residual_tests(system: DiscSystem, fit_: Fit, noise: float) -> ResidualTests
     )
 
 
-ValidRange = Mapping[
-    str, float
-]  # frames that the model describes, and the nutation where they end within the recording
+# frames that the model describes, and the nutation where they end within the recording
+ValidRange = Mapping[str, float]
 
 
 def valid_ranges(system: DiscSystem, judged: System, base: Fit, noise: float) -> dict[str, ValidRange | None]:

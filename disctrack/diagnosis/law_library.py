@@ -20,7 +20,6 @@ from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.significance import SURE, as_sigmas, wald
 from disctrack.discrepancy.system import Candidate, Values
 
-WIDTHS = ("width", "softness", "length", "lasting")  # shape parameters that correlate with the amplitude
 HIGHEST_HARMONIC = 4  # of the angles
 DRIFT_DEGREE = 4  # of the polynomials in time
 FASTEST_HUM = 150.0  # [Hz]
@@ -72,12 +71,6 @@ class LearnedLaw:
     def is_significant(self, fitted: Fit) -> bool:
         """Are the coefficients of each family different from zero, given the covariances of the fit?"""
         return all(differ_from_zero(*fitted.amounts(names)) for names in self.amounts)
-
-    @property
-    def widths(self) -> set[str]:
-        """Names of shape parameters that are held until the others are fitted."""
-        pairs = zip(self.families, self.shapes, strict=True)
-        return {name for family, names in pairs for key, name in zip(family.shape, names, strict=True) if key in WIDTHS}
 
     @property
     def formulas(self) -> dict[str, str]:
@@ -357,6 +350,9 @@ def _uneven(path: Array) -> Iterator[Row]:
     places = (np.unique(np.round(path / 0.006), axis=0) * 0.006).tolist()
     tops = [{"x0": x0, "y0": y0, "length": length} for x0, y0 in places for length in (0.005, 0.012)]
     yield "a hill or dip of the table", "hill", ({"load_m": hill},), tops
+    for words, component, factor in (("the load", "load_m", "1.0"), ("psidot", "M_m", "psidot")):
+        sticky = {component: f"{factor} * exp(-{away2})"}
+        yield f"a moment M_m by {words} at a place of the table", f"place, {words}", (sticky,), tops
 
 
 def _bumps() -> Iterator[Row]:

@@ -58,7 +58,7 @@ def learn(
         worth = [g for g in scan.gains(library) if g.gain / noise > price * g.family.n_numbers + looked]
         begin, inexact = (base_alone(base, along), along.cost) if along is not None else (current, scan.chi_square)
         chosen = _worth_a_refit(worth, scan.chi_square, inexact, noise, price, against)
-        trials = [_refitted(system, base, law, begin, g) for g in chosen if system.budget.open()]
+        trials = [_refitted(system, base, law, begin, g, noise) for g in chosen if system.budget.open()]
         lengths = [t.cost / noise + sum(price * f.n_numbers + looked for f in one.families) for one, t in trials]
         if not trials or min(lengths) >= shortest:
             break
@@ -142,18 +142,21 @@ def _worth_a_refit(
     return found
 
 
-def _refitted(system: DiscSystem, base: Fit, law: LearnedLaw | None, current: Fit, new: Gain) -> tuple[LearnedLaw, Fit]:
+def _refitted(
+    system: DiscSystem, base: Fit, law: LearnedLaw | None, current: Fit, new: Gain, noise: float
+) -> tuple[LearnedLaw, Fit]:
     """The law enlarged by a family, fitted to the data."""
     before = law.families if law else ()
     values = [current.values[n] for n in law.candidate.names] if law else []
     enlarged = law_of(system.model, (*before, new.family), np.array([*values, *new.values, *new.family.shape.values()]))
     enlarged = replace(enlarged, values=current.values | dict(enlarged.values))
     known = system.knowing(enlarged)
-    fitted = with_law(known, base, enlarged)
-    if not fitted.converged and enlarged.widths:  # the data hardly determine these: freed last
-        narrow = with_law(known, base, enlarged, enlarged.widths)
-        wide = with_law(known, base, replace(enlarged, values=narrow.values))
-        fitted = min(fitted, wide, key=lambda f: (not f.converged, f.cost))
+    shape, far = {name for names in enlarged.shapes for name in names}, current.reduced_chi_square > FAR * noise
+    fits = [] if shape and far else [with_law(known, base, enlarged)]
+    if shape and not any(f.converged for f in fits):  # it has many minima: freed where everything else fits
+        held = with_law(known, base, enlarged, shape)
+        fits.append(with_law(known, base, replace(enlarged, values=held.values)))
+    fitted = min(fits, key=lambda f: f.cost)
     return replace(enlarged, values=fitted.values), fitted
 
 

@@ -138,9 +138,7 @@ def probe(system: DiscSystem, fit_: Fit, other: Values | None = None) -> Probed 
     right, matrix = prior_rows(fit_.quantities, fit_.values)
     if other is not None:
         residual = residual - system.linearise(other, [])[0]
-        right = (
-            right - prior_rows(fit_.quantities, {**fit_.values, **other})[0]
-        )  # quantities may return to their priors
+        right = right - prior_rows(fit_.quantities, {**fit_.values, **other})[0]  # they may return to their priors
     bells = np.exp(-0.5 * ((motion.time[:, None] - middles) / (WIDTH * span / k)) ** 2)
     courses = np.zeros((len(bells), len(COMPONENTS), 3, k))
     for i in range(3):

@@ -315,6 +315,7 @@ def test_a_blow_is_an_impulse_at_an_instant():
         ("growing_force", "a level force that changes with time, degree 1", {"c_0_2": 1.2e-3, "c_0_3": -3.8e-3}),
         ("cross_drag", "a force X_n by psidot sin theta", {"c_0": 6e-4}),
         ("friction_steps", "a moment M_m by the load from an instant on", {"instant_0": 0.348}),
+        ("puddle", "a moment M_m by psidot at a place of the table", {"c_0": -1.5e-5}),
         ("seam", "a step of the table", {"c_0": 6e-6, "direction_0": 0.9, "edge_0": 0.045}),
         # a tilted table leaves 1.03 of the noise, with p = 0.02
         ("groove", "a ridge or groove of the table", {"c_0": -6e-8, "direction_0": 0.6, "edge_0": 0.05}),
