@@ -8,17 +8,18 @@ variables. Two variables are tried where one is not enough. The law is a term li
 Where the declared equations are far from the data, it is learned by multiple shooting.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations, product
+from itertools import chain, combinations, product
 from typing import Any
 
 import numpy as np
 from scipy import linalg
 
 from calibration.kit.arrays import Array
+from disctrack.discrepancy import search
 from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Term
 from disctrack.discrepancy.equations.expressions import Formula
@@ -28,20 +29,9 @@ from disctrack.discrepancy.fit import TRIAL, Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
 from disctrack.discrepancy.noise import outlier_limit, with_autocorrelation
 from disctrack.discrepancy.score import Linearisation
-from disctrack.discrepancy.search import (
-    CLASS_GAIN,
-    FAR,
-    WIDTH,
-    Diagnosis,
-    Explanation,
-    Found,
-    equivalent,
-    is_noise,
-    length,
-    with_found,
-)
 from disctrack.discrepancy.significance import evidence
 from disctrack.discrepancy.system import Candidate, GivenUp, Quantity, System, Values
+from disctrack.numbers import Measured
 
 NAME = "learned"  # of the term
 HARMONICS = (24, 8)  # highest wave number of a law of one variable, and of two
@@ -54,6 +44,10 @@ WORTH = 50.0  # of first-order -2 log evidence over the best law, up to which a 
 ROUGHLY = 4.0  # ... over this multiple of the best, where the declared equations are far from the data
 PLAUSIBLE = 4.0  # of -2 log evidence: a rougher prior may be less probable by so much
 POINTS = (61, 400)  # of the reported course, for one and two variables
+FORMULAS: Mapping[str, Callable[[Array], Array]] = {  # sums of which tell a law of one variable
+    "": np.ones_like, "{0}": np.positive, "sign {0}": np.sign, "{0}²": np.square, "{0} |{0}|": lambda x: x * np.abs(x),
+    "|{0}|": np.abs, "{0}³": lambda x: x * np.square(x),
+}  # fmt: skip
 TURNS = {"rad": 2 * np.pi, "deg": 360.0}  # a turn, by the unit of an angle
 
 
@@ -93,11 +87,11 @@ class Along:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LearnedForce(Explanation):
+class LearnedForce(search.Explanation):
     """An explanation by a learned law, the last of its candidates, and by known terms before it."""
 
     along: Along
-    instead: Explanation  # the shortest by known terms alone
+    instead: search.Explanation  # the shortest by known terms alone
     at_noise: bool  # are its residuals noise?
     noise: float  # variance over that stated
     system: EquationSystem  # with the law as a term
@@ -126,7 +120,10 @@ class LearnedForce(Explanation):
 
     @cached_property
     def course(self) -> tuple[Array, Array, Array]:
-        """Places (k, 1 or 2); the force (k,) there, in addition to the declared equations; and its sigma (k,)."""
+        """Places (k,), or (k, 2) along the motion; the force (k,) there, and its covariance (k, k).
+
+        Places are evenly over the values visited; the force is beyond the declared equations.
+        """
         law, fitted, own = self.along, self.fit, self.candidate.quantities
         visited, k = _visited(self.system, law.variables, fitted.values), len(law.variables) - 1
         ends = (0.0, law.period) if law.period else (float(visited.min()), float(visited.max()))
@@ -135,28 +132,49 @@ class LearnedForce(Explanation):
             at = visited[np.linspace(0, len(visited) - 1, POINTS[1]).astype(int)]
         names = [*(q.name for q in own), *self.held]
         force, columns = _course(self.system, law, names, fitted.values, at)
-        variance = np.einsum("ij,jk,ik->i", columns, fitted.amounts(names)[1], columns)
         # variance of the truncated basis, whose amplitudes fall as the inverse square of the wave number
         finer = (HARMONICS[0] / 6.0, np.pi / 16.0 * HARMONICS[1] ** 2)[k] * min(q.prior_sigma for q in own) ** 2
         scale = max(self.noise, fitted.reduced_chi_square)
-        return at, force, np.sqrt(scale * np.maximum(variance, 0.0) + self.noise * finer)
+        covariance = scale * columns @ fitted.amounts(names)[1] @ columns.T + self.noise * finer * np.eye(len(at))
+        return at if k else at[:, 0], force, covariance
 
     @property
     def variable(self) -> Array:
-        """(k,) from the smallest to the largest value visited; of two variables (k, 2) along the motion."""
-        return self.course[0] if len(self.along.variables) > 1 else self.course[0][:, 0]
+        """Places (k,) or (k, 2) of the course."""
+        return self.course[0]
 
     @property
     def force(self) -> Array:
-        """(k,) in addition to the declared equations."""
+        """(k,) beyond the declared equations."""
         return self.course[1]
 
     @property
     def sigma(self) -> Array:
         """(k,) of the force."""
-        return self.course[2]
+        return np.sqrt(np.diag(self.course[2]))
 
-    def is_named(self, diagnosis: Diagnosis) -> bool:
+    @cached_property
+    def formula(self) -> dict[str, Measured]:
+        """Amounts of the shortest sum of `FORMULAS`; empty if its chi-square to the course is above one per point."""
+        if len(self.along.variables) > 1 or self.along.period:
+            return {}
+        covariance, shortest, told = self.course[2], np.inf, dict[str, Measured]()
+        rounding = 1e-9 * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
+        root = np.linalg.cholesky(covariance + rounding)
+        right = linalg.solve_triangular(root, self.force, lower=True)
+        for names in chain(*(combinations(FORMULAS, n) for n in (1, 2, 3))):
+            columns = np.stack([FORMULAS[name](self.variable) for name in names], axis=1)
+            matrix = linalg.solve_triangular(root, columns, lower=True)
+            amounts = np.linalg.lstsq(matrix, right)[0]
+            left = float(np.sum((right - matrix @ amounts) ** 2))
+            its = left + search.CLASS_GAIN * len(names)
+            if left < len(right) and its < shortest:
+                shortest, sigmas = its, np.sqrt(np.diag(np.linalg.pinv(matrix.T @ matrix)))
+                words = (name.format(self.along.variable) for name in names)
+                told = dict(zip(words, map(Measured, amounts, sigmas), strict=True))
+        return told
+
+    def is_named(self, diagnosis: search.Diagnosis) -> bool:
         """Is the law reported as the best description, together with all known terms that were found?"""
         stays = {f.candidate.name for f in diagnosis.found} <= {c.name for c in self.known}
         return self.is_shorter and (self.at_noise or stays)
@@ -164,7 +182,7 @@ class LearnedForce(Explanation):
     @property
     def is_shorter(self) -> bool:
         """Is it shorter than the best known terms? Of two that are indistinguishable, the known one is reported."""
-        return self.length < self.instead.length - CLASS_GAIN
+        return self.length < self.instead.length - search.CLASS_GAIN
 
     def document(self) -> dict[str, Any]:
         """Its course in JSON types, with the alternatives."""
@@ -177,6 +195,7 @@ class LearnedForce(Explanation):
             "beside": [c.name for c in self.known],
             "at": self.variable,
             "force": self.force,
+            "formula": {function: vars(amount) for function, amount in self.formula.items()},
             "sigma": self.sigma,
             "at_noise": self.at_noise,
             "minus_2_log_evidence": self.length,
@@ -186,7 +205,7 @@ class LearnedForce(Explanation):
         }
 
     def text(self, units: Mapping[str, str]) -> str:
-        """Its course at both ends, in the middle, and at its extremes; of two variables at quantiles of the force."""
+        """Its formula, or its course at both ends, in the middle and at its extremes; of two variables at quantiles."""
         places, last = self.variable.reshape(len(self.force), -1), len(self.force) - 1
         order, points = np.argsort(self.force), []
         shown = order[np.linspace(0, last, 5).round().astype(int)]
@@ -197,11 +216,12 @@ class LearnedForce(Explanation):
             where = ", ".join(f"{x:.3g} {unit if unit != '1' else ''}".rstrip() for x, unit in place)
             points.append(f"{self.force[i]:.3g}({self.sigma[i]:.2g}) at {where}")
         held = f", beyond {' and '.join(self.held)} as declared" if self.held else ""
-        return f"{self.along.title} [{NAME}{held}]: {'; '.join(points)}"
+        formula = " + ".join(f"({amount}) {function}".rstrip() for function, amount in self.formula.items())
+        return f"{self.along.title} [{NAME}{held}]: {formula or '; '.join(points)}"
 
 
 def learn(
-    system: EquationSystem, diagnosis: Diagnosis, channels: Mapping[str, Formula], judged: System | None = None
+    system: EquationSystem, diagnosis: search.Diagnosis, channels: Mapping[str, Formula], judged: System | None = None
 ) -> LearnedForce | None:
     """The law of the largest evidence; together with a known term, or of two variables, where that is needed.
 
@@ -228,19 +248,19 @@ def learn(
     return law if reportable else _nearest(one.system, diagnosis, judged)
 
 
-def _nearest(system: EquationSystem, diagnosis: Diagnosis, judged: System | None) -> LearnedForce | None:
+def _nearest(system: EquationSystem, diagnosis: search.Diagnosis, judged: System | None) -> LearnedForce | None:
     """The law that improves the best known terms, with their residuals taken for noise; it is no finding.
 
     With good sensors no model of a real system leaves noise. None where known terms do not come near the data.
     """
     known, d = diagnosis.ranked[0], diagnosis
     noise = max(d.noise, known.fit.reduced_chi_square)
-    near = known.candidates and d.before.reduced_chi_square > FAR * noise
+    near = known.candidates and d.before.reduced_chi_square > search.FAR * noise
     if d.verdict != "unexplained" or not near:
         return None
     view = system if judged is None else judged.over(system)
     before = held_out(view, known.fit.quantities, known.fit.values, system.training)
-    known = replace(known, length=length(view, d.settings, noise, known.fit, known.candidates))
+    known = replace(known, length=search.length(view, d.settings, noise, known.fit, known.candidates))
     worse = replace(d, noise=noise, before=known.fit, held_out_before=before, ranked=(known,))
     over = _Competition(1, system, worse, judged)
     law = over.best(known.candidates)
@@ -253,17 +273,19 @@ def _nearest(system: EquationSystem, diagnosis: Diagnosis, judged: System | None
 class _Competition:
     """Comparison of laws with each other and with known terms, by the evidence of the same samples."""
 
-    def __init__(self, variables: int, system: EquationSystem, diagnosis: Diagnosis, judged: System | None) -> None:
+    def __init__(
+        self, variables: int, system: EquationSystem, diagnosis: search.Diagnosis, judged: System | None
+    ) -> None:
         self.system, self.diagnosis, self.noise = system, diagnosis, diagnosis.noise
         self._judged = judged
         base = diagnosis.before
         self.begin = dict(base.values)
         chi_square = float(np.sum(system.linearise(self.begin, [])[0] ** 2))
-        self.far = not chi_square < FAR * self.noise * max(float(np.sum(system.weights)), 1.0)
+        self.far = not chi_square < search.FAR * self.noise * max(float(np.sum(system.weights)), 1.0)
         self.laws = tuple(_laws(system, self.begin, variables))
         self.trials_penalty = 2.0 * float(np.log(max(len(self.laws), 1)))
         self.shots = shooting.levels(system) if self.far else [system]
-        self.instead = next((e for e in diagnosis.ranked if e.candidates), Explanation((), base))
+        self.instead = next((e for e in diagnosis.ranked if e.candidates), search.Explanation((), base))
 
     def view(self, system: EquationSystem) -> System:
         """The system with the noise as estimated."""
@@ -271,11 +293,11 @@ class _Competition:
 
     def has_converged(self, fitted: Fit) -> bool:
         """Is the promised gain insignificant? Along directions that only the prior determines, steps never end."""
-        return fitted.converged or fitted.promised < CLASS_GAIN * self.noise
+        return fitted.converged or fitted.promised < search.CLASS_GAIN * self.noise
 
     def at_noise(self, system: System, fitted: Fit) -> bool:
         """As in the search; and has the law no outliers? A kink that it does not follow raises the noise, too."""
-        if not (self.has_converged(fitted) and is_noise(fitted, self.diagnosis.settings, self.noise)):
+        if not (self.has_converged(fitted) and search.is_noise(fitted, self.diagnosis.settings, self.noise)):
             return False
         size = np.abs(system.linearise(fitted.values, [])[0])
         return not size.max() > outlier_limit(size[size > 0])  # missing data have zeros
@@ -284,7 +306,7 @@ class _Competition:
         """Known terms that may act with a law: those of the shortest explanations."""
         named = dict.fromkeys(c.name for e in self.diagnosis.ranked for c in e.candidates)
         own = {c.name: c for c in self.system.candidates}
-        return [own[name] for name in named if name in own][:WIDTH]
+        return [own[name] for name in named if name in own][: search.WIDTH]
 
     def is_reportable(self, law: LearnedForce) -> bool:
         """Does the law predict held-out data, and leave noise, or nearly all of the excess chi-square explained?
@@ -297,7 +319,7 @@ class _Competition:
         gain, error = law.held_out.gain_over(d.held_out_before, self.noise), law.held_out.chi_square
         # where no two values return, any force is a function of them: by its values, and not by a wide uncertainty
         closer = len(law.along.variables) == 1 or error < d.held_out_before.chi_square
-        if not (gain > CLASS_GAIN and closer):
+        if not (gain > search.CLASS_GAIN and closer):
             return False
         most = d.settings.unexplained_share * d.before.excess(self.noise)
         predicts = d.held_out_after is None or error < d.held_out_after.chi_square
@@ -323,14 +345,14 @@ class _Competition:
         trials: list[LearnedForce] = []
         shortest = min((length for length, law, _ in scans if not law.of_time), default=0.0)
         # where the declared equations do not follow the data, the first order is a rough guide
-        enough = ROUGHLY * shortest + WORTH if self.far else shortest + CLASS_GAIN
+        enough = ROUGHLY * shortest + WORTH if self.far else shortest + search.CLASS_GAIN
         for length, law, quantities in scans[:REFITTED]:
             if length > enough or not self.system.budget.open():
                 break
             trials += self._fitted(law, known, quantities, values, self.shots)
         if not trials:
             return None
-        near = equivalent([trial for trial in trials if self.has_converged(trial.fit)] or trials)
+        near = search.equivalent([trial for trial in trials if self.has_converged(trial.fit)] or trials)
         # a function of time fits any motion: a function of the state says more, and is tested by every other run
         best = min(near, key=lambda trial: trial.along.of_time)
         if known:  # which may only have led to the law
@@ -398,13 +420,13 @@ class _Competition:
             there = replace(system, widths=first.widths)
             others, view = self._others(there, known), self.view(there) if system is shots[-1] else there
             fitted = fit(view, (*others, *own), now, TRIAL)
-            if not fitted.reduced_chi_square < FAR * self.noise:  # longer stretches leave more
+            if not fitted.reduced_chi_square < search.FAR * self.noise:  # longer stretches leave more
                 return None
             now = dict(fitted.values)
             evident, own = self._evidence(there, law, known, now)
         fitted = fit(view, (*others, *own), now, TRIAL)
         # declared parameters and known terms have their usual penalties; that of the law is part of the evidence
-        penalties = length(view, self.diagnosis.settings, self.noise, fitted, known) - fitted.cost / self.noise
+        penalties = search.length(view, self.diagnosis.settings, self.noise, fitted, known) - fitted.cost / self.noise
         there = _set(self.system, law, fitted.values)[0]
         return LearnedForce(
             (*known, _candidate(law, own)), fitted, length=evident + penalties, along=law, instead=self.instead,
@@ -570,7 +592,7 @@ def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Va
     return (now - before)[:, here] / acting, own / acting[:, None]
 
 
-def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:
+def with_law(diagnosis: search.Diagnosis, law: LearnedForce) -> search.Diagnosis:
     """The answer with the law, and the known terms that were fitted with it, in place of what was found.
 
     Where its residuals are not noise, the law is the nearest description, and what was found stays. A function of time
@@ -594,9 +616,9 @@ def with_law(diagnosis: Diagnosis, law: LearnedForce) -> Diagnosis:
         return nothing
     held_gain = law.held_out.gain_over(diagnosis.held_out_before, diagnosis.noise)
     gain = (diagnosis.before.cost - law.fit.cost) / diagnosis.noise
-    found = [Found(c, gain, held_gain, 0.0, ()) for c in law.candidates]
+    found = [search.Found(c, gain, held_gain, 0.0, ()) for c in law.candidates]
     answer = replace(
         nothing, verdict="found", reason=f"with a law that no term names, chi-square falls to {level}",
         found=tuple(found[:-1]), after=law.fit, held_out_after=law.held_out, nearest=None,
     )  # fmt: skip
-    return with_found(answer, found[-1:])
+    return search.with_found(answer, found[-1:])

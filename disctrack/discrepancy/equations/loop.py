@@ -7,6 +7,7 @@ import numpy as np
 from scipy.linalg import qr
 
 from calibration.kit.arrays import Array
+from disctrack.discrepancy import noise
 from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations import terms as library
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
@@ -15,15 +16,6 @@ from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit, fit, no_fit
-from disctrack.discrepancy.noise import (
-    autoregression,
-    correlation_lag,
-    noise_sigma,
-    prewhitened,
-    quantisation,
-    with_autocorrelation,
-    with_noise,
-)
 from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import WIDTH, Diagnosis, Former, Settings, explain
 from disctrack.discrepancy.significance import wald
@@ -65,7 +57,7 @@ def find_missing(
         by_name = {term.name: term for term in (*library.usual(replace(equations, observed=channels)), *limits)}
         terms = tuple(by_name.values())
     compiled = Formulas(equations, tuple(terms), channels)
-    whole = EquationSystem(compiled, with_noise(given), np.ones(len(compiled.states)), {})
+    whole = EquationSystem(compiled, noise.with_noise(given), np.ones(len(compiled.states)), {})
     system, diagnosis, more = _first_answer(whole, settings)
     notes += more
     if not np.isfinite(diagnosis.before.chi_square):
@@ -306,17 +298,17 @@ def _prewhiten(system: EquationSystem, diagnosis: Diagnosis, settings: Settings)
     present = np.zeros(residual.shape, bool)
     for rows, s in zip(system.blocks, system.stretches, strict=True):
         present[rows] = np.isfinite(s.data)
-    coefficients, share = autoregression(residual, present, system.blocks)
+    coefficients, share = noise.autoregression(residual, present, system.blocks)
     if not coefficients.any():
         return diagnosis, False, []
     size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
     longest = shooting.longest_stretches(system)
-    lasting = correlation_lag(residual, system.blocks) * float(np.median(np.diff(longest[0].time)))
+    lasting = noise.correlation_lag(residual, system.blocks) * float(np.median(np.diff(longest[0].time)))
     shortest_period = min(min(shooting.period(s), _decorrelation_period(s)) for s in longest)
     # slow residuals are errors of the model, although an autoregression can predict them
     as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_period
     as_noise &= size <= NO_SENSOR
-    white = prewhitened(system, system.blocks, coefficients, present)
+    white = noise.prewhitened(system, system.blocks, coefficients, present)
     base = fit(white, system.base, diagnosis.before.values) if as_noise else None
     if base is None or not base.converged:
         if diagnosis.verdict != "unexplained":
@@ -324,8 +316,8 @@ def _prewhiten(system: EquationSystem, diagnosis: Diagnosis, settings: Settings)
         reason = f"residuals are {size:.3g} times the noise and correlated over {lasting:.2g} s: no sensor's noise"
         diagnosis = replace(_with_residual_sigmas(system, diagnosis), reason=reason)
         return diagnosis, False, ["sigmas are scaled to the residuals, which are larger than the noise"]
-    noise = float(share * size**2)
-    again = explain(white, base.values, replace(settings, noise=noise), system.training, _starts(diagnosis))
+    level = float(share * size**2)
+    again = explain(white, base.values, replace(settings, noise=level), system.training, _starts(diagnosis))
     order = int(np.max(np.nonzero(coefficients)[1])) + 1
     text = f"residuals are autocorrelated over {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
     return replace(again, judged=again.judged or white), True, [text]
@@ -339,19 +331,19 @@ def _decorrelation_period(s: Samples) -> float:
     rows = np.isfinite(s.data)
     mean = np.nansum(s.data, axis=0) / np.maximum(rows.sum(axis=0), 1)  # a channel may show nothing in a stretch
     away = np.where(rows, (s.data - mean) / s.sigma, 0.0)
-    return correlation_lag(away, [slice(0, len(away))]) * float(np.median(np.diff(s.time))) / FORGOTTEN
+    return noise.correlation_lag(away, [slice(0, len(away))]) * float(np.median(np.diff(s.time))) / FORGOTTEN
 
 
 def _with_residual_sigmas(system: EquationSystem, diagnosis: Diagnosis) -> Diagnosis:
     """Sigmas scaled by the residuals, and gains by Wald's test with these."""
-    after, nearest = with_autocorrelation(system, diagnosis.after), diagnosis.nearest
+    after, nearest = noise.with_autocorrelation(system, diagnosis.after), diagnosis.nearest
     gains = [wald(*after.amounts(f.candidate.names)) for f in diagnosis.found]
     return replace(
         diagnosis,
         found=tuple(replace(f, gain=gain) for f, gain in zip(diagnosis.found, gains, strict=True)),
-        before=with_autocorrelation(system, diagnosis.before),
+        before=noise.with_autocorrelation(system, diagnosis.before),
         after=after,
-        nearest=None if nearest is None else replace(nearest, fit=with_autocorrelation(system, nearest.fit)),
+        nearest=None if nearest is None else replace(nearest, fit=noise.with_autocorrelation(system, nearest.fit)),
     )
 
 
@@ -377,8 +369,8 @@ def _sensor_notes(samples: Sequence[Samples], channel: int, name: str) -> tuple[
     """Notes on the resolution of a sensor, and on limits of its range; sides (1: above, -1) on which it is at one."""
     notes, sides = [], []
     values = [s.data[:, channel] for s in samples if np.isnan(s.sigma[:, channel]).any()]
-    step = quantisation(values) if values else 0.0
-    if step and noise_sigma(values) < 3 * step:
+    step = noise.quantisation(values) if values else 0.0
+    if step and noise.noise_sigma(values) < 3 * step:
         notes.append(f"{name} has a resolution of {step:.4g}, a rounding noise of {step / np.sqrt(12):.3g}")
     everything = np.concatenate([s.data[:, channel] for s in samples])
     least, most = np.nanmin(everything, initial=np.inf), np.nanmax(everything, initial=-np.inf)

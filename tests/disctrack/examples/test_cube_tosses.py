@@ -6,17 +6,8 @@ from copy import copy
 import numpy as np
 import pytest
 
+from disctrack.examples import cube_tosses
 from disctrack.examples._command import command
-from disctrack.examples.cube_tosses import (
-    CLEARANCE,
-    CubeTosses,
-    diagnosed,
-    errors,
-    example,
-    flights,
-    read_tosses,
-    without_copies,
-)
 from tests.oracles import tossed_cube
 
 N = 50  # tosses that are simulated
@@ -27,23 +18,23 @@ def published(shared_data):
     folder = shared_data / "contactnets_cube"
     if not (folder / "cube_tosses.npz").is_file():
         pytest.skip(f"{folder} is not there")
-    return read_tosses(folder)
+    return cube_tosses.read_tosses(folder)
 
 
 @pytest.fixture(scope="module")
 def answer(published):
     system = system_of(published)
-    return system, diagnosed(system)
+    return system, cube_tosses.diagnosed(system)
 
 
 def system_of(tosses):
-    return CubeTosses(flights(without_copies(tosses)))
+    return cube_tosses.CubeTosses(cube_tosses.flights(cube_tosses.without_copies(tosses)))
 
 
 def simulated(rng, folder, n=N, **hidden):
     state, offset = tossed_cube.toss(rng, n, **hidden)
     np.savez(folder / "cube_tosses.npz", state=state.astype(np.float32), offset=offset)
-    return read_tosses(folder)
+    return cube_tosses.read_tosses(folder)
 
 
 def named(diagnosis):
@@ -66,7 +57,7 @@ def named(diagnosis):
 )
 def test_what_is_hidden_in_simulated_tosses_is_named_and_sized(rng, tmp_path, hidden, expected):
     system = system_of(simulated(rng, tmp_path, **hidden))
-    found = diagnosed(system)
+    found = cube_tosses.diagnosed(system)
     assert named(found) == {key.partition(".")[0] for key in expected}
     assert found.verdict == ("found" if expected else "nothing missing")
     for key, value in expected.items():
@@ -77,25 +68,25 @@ def test_what_is_hidden_in_simulated_tosses_is_named_and_sized(rng, tmp_path, hi
 @pytest.mark.statistical
 def test_gravity_and_frame_rate_are_one_number_where_cubes_at_rest_deny_the_scale(rng, tmp_path):
     system = system_of(simulated(rng, tmp_path, gravity=9.7))
-    found = diagnosed(system)
+    found = cube_tosses.diagnosed(system)
     (effect,) = found.found
     alternatives = {r.candidate.name for r in effect.cannot_be_told_from}
     assert {effect.candidate.name} | alternatives == {"gravity", "frame_rate"}
 
 
 def test_flights_end_before_contact_and_begin_after_release(published):
-    tosses = without_copies(published[:180])
-    found = flights(tosses)
+    tosses = cube_tosses.without_copies(published[:180])
+    found = cube_tosses.flights(tosses)
     assert len(found) > 0.85 * len(tosses)
     for f in found[::10]:
-        assert f.toss.clearance[1 : 1 + len(f.time)].min() > CLEARANCE
+        assert f.toss.clearance[1 : 1 + len(f.time)].min() > cube_tosses.CLEARANCE
     # second differences of the height scatter about g by sqrt(6) x 24 um x rate^2 = 1.3 m/s^2; a contact adds hundreds
     bends = np.concatenate([np.diff(f.position[:, 2], 2) for f in found]) * 148.0**2
     assert np.percentile(np.abs(bends + 9.6), 99.5) < 6
 
 
 def test_some_published_tosses_are_copies_of_others_turned_about_the_vertical(published):
-    assert (len(published), len(without_copies(published))) == (570, 537)
+    assert (len(published), len(cube_tosses.without_copies(published))) == (570, 537)
 
 
 @pytest.mark.statistical
@@ -113,7 +104,7 @@ def test_published_tosses_lack_a_scale_a_vertical_and_the_place_of_the_centre_of
     assert values["centre_of_mass.c_3"] == pytest.approx(5.4e-3, abs=0.6e-3)
     assert values["principal_moments.e_11"] == pytest.approx(0.064, abs=0.01)
     assert values["principal_moments.e_22"] == pytest.approx(0.052, abs=0.01)
-    before, after = errors(system, d)
+    before, after = cube_tosses.errors(system, d)
     assert all(after[group] < 0.6 * before[group] for group in ("horizontal", "vertical"))
     assert after["horizontal"] < 30e-6
     assert after["vertical"] < 26e-6
@@ -132,7 +123,7 @@ def test_what_a_flight_s_own_motion_makes_whole_leaves_no_trace(answer):
 def test_a_wrong_effect_alone_does_not_bring_the_residual_to_noise(answer):
     system = copy(answer[0])
     system.candidates = tuple(c for c in system.candidates if c.name in ("clock_offset", "rotational_drag", "tilt"))
-    refused = diagnosed(system)
+    refused = cube_tosses.diagnosed(system)
     assert refused.verdict == "unexplained"
     assert not refused.found
 
@@ -142,12 +133,12 @@ def test_shuffled_residuals_of_the_tosses_give_no_finding(answer, rng):
     system, d = copy(answer[0]), answer[1]
     residual, _ = system.linearise(d.after.values, [])
     system.seen = rng.permutation(residual[:, 0])
-    assert not diagnosed(system).found
+    assert not cube_tosses.diagnosed(system).found
 
 
 def test_command_writes_the_diagnosis_of_the_tosses(rng, tmp_path, capsys):
     simulated(rng, tmp_path, 30, scale=-0.02)
-    command(example, "tosses", [str(tmp_path), "-o", str(tmp_path / "out")])
+    command(cube_tosses.example, "tosses", [str(tmp_path), "-o", str(tmp_path / "out")])
     assert "length_scale" in capsys.readouterr().out
     found = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert found["verdict"] == "found"
@@ -155,5 +146,5 @@ def test_command_writes_the_diagnosis_of_the_tosses(rng, tmp_path, capsys):
     assert found["after"]["reduced_chi_square"] < 1.15
     assert found["before"]["rms"]["vertical"] > found["after"]["rms"]["vertical"]
     with pytest.raises(SystemExit):
-        command(example, "tosses", [str(tmp_path / "out")])
+        command(cube_tosses.example, "tosses", [str(tmp_path / "out")])
     assert "cube_tosses.npz" in capsys.readouterr().err

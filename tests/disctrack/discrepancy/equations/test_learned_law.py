@@ -66,9 +66,21 @@ def test_a_law_of_one_variable_is_learned(name):
     assert np.mean(np.abs(pulls) < 3) >= 0.85
     assert np.sqrt(np.mean(pulls**2)) < 2.0
     assert np.sqrt(np.mean(law.sigma**2)) < 0.15 * np.ptp(truth)
+    assert bool(law.formula) == (name == "a drag in one direction")  # v and |v|; the others have no usual form
     # known terms are told with their odds, and what is left is noise
     if variable != "t":
         assert answer.after["x"].rms == pytest.approx(SIGMA, rel=0.1)
+
+
+@pytest.mark.parametrize(("of", "size"), [("v |v|", -0.3), ("sign v", -1.2)])
+def test_a_law_of_usual_form_is_told_by_its_formula(of, size):
+    """Beside what the declared friction lacks: 0.06 v."""
+    f = {"v |v|": lambda v: v * np.abs(v), "sign v": lambda v: np.tanh(v / 1e-3)}[of]
+    law = diagnose(OSCILLATOR, recorded(lambda x, v, t: size * f(v), seed=11), []).law
+    assert law.formula.keys() == {"v", of}
+    for function, amount in {"v": -0.06, of: size}.items():
+        assert abs(law.formula[function].value - amount) < 3.5 * law.formula[function].sigma < 0.2 * abs(size)
+    assert law.text({}).endswith(f"v + ({law.formula[of]}) {of}")
 
 
 def test_a_law_of_time_that_fits_first_does_not_keep_a_law_of_the_state_from_being_tried(rng):
@@ -215,7 +227,7 @@ def test_the_law_is_told_on_the_page_and_in_json(tmp_path):
     assert {"verdict", "sentence", "effects", "before", "after", "tried", "notes", "runs"} <= set(found)
     assert found["after"]["channels"]["x"]["rms"] < found["before"]["channels"]["x"]["rms"]
     law = found["law"]
-    assert law["variable"] == "v"
+    assert (law["variable"], law["formula"].keys()) == ("v", answer.law.formula.keys())
     assert len(law["at"]) == len(law["force"]) == len(law["sigma"])
     assert law["known_terms"] == [c.name for c in answer.law.instead.candidates]
     assert "a force on v that is a function of v, learned from the residuals" in page.read_text()
