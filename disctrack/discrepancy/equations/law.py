@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from scipy import linalg
+from scipy.spatial import KDTree
 
 from calibration.kit.arrays import Array
 from disctrack.discrepancy import search
@@ -44,9 +45,10 @@ WORTH = 50.0  # of first-order -2 log evidence over the best law, up to which a 
 ROUGHLY = 4.0  # ... over this multiple of the best, where the declared equations are far from the data
 PLAUSIBLE = 4.0  # of -2 log evidence: a rougher prior may be less probable by so much
 POINTS = (61, 400)  # of the reported course, for one and two variables
-FORMULAS: Mapping[str, Callable[[Array], Array]] = {  # sums of which tell a law of one variable
-    "": np.ones_like, "{0}": np.positive, "sign {0}": np.sign, "{0}²": np.square, "{0} |{0}|": lambda x: x * np.abs(x),
-    "|{0}|": np.abs, "{0}³": lambda x: x * np.square(x),
+# sums of which tell a law of one variable; the last three where it has both signs
+FORMULAS: Mapping[str, Callable[[Array], Array]] = {
+    "": np.ones_like, "{0}": np.positive, "{0}²": np.square, "{0}³": lambda x: x * np.square(x), "|{0}|": np.abs,
+    "sign {0}": np.sign, "{0} |{0}|": lambda x: x * np.abs(x),
 }  # fmt: skip
 TURNS = {"rad": 2 * np.pi, "deg": 360.0}  # a turn, by the unit of an angle
 
@@ -156,19 +158,18 @@ class LearnedForce(search.Explanation):
     @cached_property
     def formula(self) -> dict[str, Measured]:
         """Amounts of the shortest sum of `FORMULAS`; empty if its chi-square to the course is above one per point."""
-        if len(self.along.variables) > 1 or self.along.period:
+        (places, force, covariance), shortest, told = self.course, np.inf, dict[str, Measured]()
+        if places.ndim > 1 or self.along.period or not np.isfinite(force @ covariance @ force):
             return {}
-        covariance, shortest, told = self.course[2], np.inf, dict[str, Measured]()
-        rounding = 1e-9 * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
-        root = np.linalg.cholesky(covariance + rounding)
-        right = linalg.solve_triangular(root, self.force, lower=True)
-        for names in chain(*(combinations(FORMULAS, n) for n in (1, 2, 3))):
-            columns = np.stack([FORMULAS[name](self.variable) for name in names], axis=1)
+        root = np.linalg.cholesky(covariance + 1e-9 * np.trace(covariance) / len(force) * np.eye(len(force)))
+        right = linalg.solve_triangular(root, force, lower=True)
+        usual = list(FORMULAS)[: None if places.min() < 0 < places.max() else -3]
+        for names in chain(*(combinations(usual, n) for n in (1, 2, 3))):
+            columns = np.stack([FORMULAS[name](places) for name in names], axis=1)
             matrix = linalg.solve_triangular(root, columns, lower=True)
             amounts = np.linalg.lstsq(matrix, right)[0]
             left = float(np.sum((right - matrix @ amounts) ** 2))
-            its = left + search.CLASS_GAIN * len(names)
-            if left < len(right) and its < shortest:
+            if left < len(right) and (its := left + search.CLASS_GAIN * len(names)) < shortest:
                 shortest, sigmas = its, np.sqrt(np.diag(np.linalg.pinv(matrix.T @ matrix)))
                 words = (name.format(self.along.variable) for name in names)
                 told = dict(zip(words, map(Measured, amounts, sigmas), strict=True))
@@ -276,8 +277,7 @@ class _Competition:
     def __init__(
         self, variables: int, system: EquationSystem, diagnosis: search.Diagnosis, judged: System | None
     ) -> None:
-        self.system, self.diagnosis, self.noise = system, diagnosis, diagnosis.noise
-        self._judged = judged
+        self.system, self.diagnosis, self.noise, self._judged = system, diagnosis, diagnosis.noise, judged
         base = diagnosis.before
         self.begin = dict(base.values)
         chi_square = float(np.sum(system.linearise(self.begin, [])[0] ** 2))
@@ -327,8 +327,7 @@ class _Competition:
 
     def best(self, known: tuple[Candidate, ...]) -> LearnedForce | None:
         """The law of the largest evidence, fitted together with these terms."""
-        first = self.shots[0]
-        values = self.begin
+        first, values = self.shots[0], self.begin
         if self.far:
             declared = {q.name: q.null for q in first.base if not q.is_initial}
             values = self.begin | declared | shooting.initial_guess(first)[0]
@@ -573,23 +572,26 @@ def _part_of_law(f: Formulas, law: Along, held: Sequence[str]) -> set[str]:
 def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Values, at: Array) -> tuple[Array, Array]:
     """Force (n,) by these parameters, relative to the declared ones, at places (n, k); derivatives (n, names)."""
     f, s = system.formulas, system.stretches[0]
-    states = np.tile(system.start_of(values, s), (len(at), 1))
+    # other states and inputs as they were near these places: elsewhere the equations may have no value
+    near = KDTree(_visited(replace(system, stretches=(s,)), law.variables, values)).query(at)[1]
+    motion = system.predict(values, s)
+    states = np.tile(system.start_of(values, s), (len(at), 1)) if motion is None else motion.states[near]
     times = at[:, 0] if law.of_time else np.asarray(np.arange(len(at)) + 0.5, float)
     pieces = np.zeros((len(s.pieces), 5, len(at)))
+    pieces[:, 3] = np.reshape([u[near] for u in system.inputs_of(s)[: len(s.pieces)]], (-1, len(at)))
     for variable, x in zip(law.variables, at.T, strict=True):
         if variable in f.equations.states:
             states[:, f.equations.states.index(variable)] = x
         elif variable in f.equations.inputs:
             pieces[list(f.equations.inputs).index(variable), 3] = x
-            s = replace(s, knots=np.arange(len(at) + 1.0), pieces=pieces)
+    s = s if law.of_time else replace(s, knots=np.arange(len(at) + 1.0), pieces=pieces)
     declared = {name: f.declared[name].value for name in names}
     here = f.equations.states.index(law.equation)
     (now, _, by_number), (before, *_) = (
         f.rates_at(s, system.numbers({**values, **changed}, s), times, states) for changed in ({}, declared)
     )
-    acting = by_number[:, here, f.names.index(names[0])]  # of the constant
     own = by_number[:, here, [f.names.index(name) for name in names]]
-    return (now - before)[:, here] / acting, own / acting[:, None]
+    return (now - before)[:, here] / own[:, 0], own / own[:, :1]  # first that by the constant
 
 
 def with_law(diagnosis: search.Diagnosis, law: LearnedForce) -> search.Diagnosis:

@@ -11,15 +11,9 @@ from calibration.judge.tolerances import SIZE
 from disctrack.disc import MA_2014
 from disctrack.faults.keys import CameraFault, Faults
 from disctrack.frames import rotation_from_euler, rotation_from_vector, vector_from_rotation
+from disctrack.track.refine import self_calibration
 from disctrack.track.refine.assembly import fit_all
 from disctrack.track.refine.scatter import split_scatter, without_shared_faults
-from disctrack.track.refine.self_calibration import (
-    declared_places_kept,
-    motions_of_pattern,
-    pattern_place,
-    refine_as_built,
-    share_of_places,
-)
 from disctrack.trajectory import FrameStatus
 from disctrack.validate.points import SIGMA_PX
 from tests.oracles.measured_disc import dots_of, measured
@@ -93,10 +87,10 @@ def test_the_place_of_a_pattern_is_as_uncertain_as_its_dots_are_misplaced(m, rng
     ratios = []
     for _ in range(400):
         shift = 3e-5 * rng.normal(size=(m, 2))
-        kept = declared_places_kept(disc, shift)
+        kept = self_calibration.declared_places_kept(disc, shift)
         moved = shift - kept[:, :2]
         turn = float(np.sum(off[:, 0] * moved[:, 1] - off[:, 1] * moved[:, 0]) / np.sum(off**2))
-        place_variance, turn_variance = pattern_place(disc, kept, np.full((m, 2), 6e-7))
+        place_variance, turn_variance = self_calibration.pattern_place(disc, kept, np.full((m, 2), 6e-7))
         ratios.append([*(moved.mean(axis=0) ** 2 / place_variance), turn**2 / turn_variance])
     trimmed = np.sort(ratios, axis=0)[:-4]  # few dots may agree by chance: of 400 the four worst
     assert np.all((trimmed.mean(axis=0) > 0.5) & (trimmed.mean(axis=0) < 1.5)), trimmed.mean(axis=0)
@@ -105,10 +99,10 @@ def test_the_place_of_a_pattern_is_as_uncertain_as_its_dots_are_misplaced(m, rng
 def test_dots_as_declared_and_one_that_is_not_leave_the_pattern_where_it_is(rng):
     sigma = np.full((6, 2), 6e-7)
     within = np.column_stack([0.5 * sigma * rng.normal(size=(6, 2)), np.zeros(6)])
-    assert pattern_place(MA_2014, within, sigma) == (0, 0)
+    assert self_calibration.pattern_place(MA_2014, within, sigma) == (0, 0)
     one = np.zeros((6, 3))
     one[2, 0] = 1e-3
-    assert pattern_place(MA_2014, one, sigma) == (0, 0)
+    assert self_calibration.pattern_place(MA_2014, one, sigma) == (0, 0)
 
 
 def test_poses_move_with_the_pattern():
@@ -118,12 +112,12 @@ def test_poses_move_with_the_pattern():
     middle = disc.marker_centres_body.mean(axis=0)
     R_found = R @ rotation_from_vector(np.array([0, 0, turn]))
     t_found = R @ (middle + np.array([*displaced, 0])) - R_found @ middle
-    expected = motions_of_pattern(R[None], disc)[0] @ [*displaced, turn]
+    expected = self_calibration.motions_of_pattern(R[None], disc)[0] @ [*displaced, turn]
     np.testing.assert_allclose(t_found, expected[:3], atol=1e-8)
     np.testing.assert_allclose(vector_from_rotation(R_found @ R.T), expected[3:], atol=1e-7)
     # and no dot is said to have moved in it
     turned = turn * np.column_stack([-disc.marker_centres_body[:, 1], disc.marker_centres_body[:, 0]]) + displaced
-    assert_allclose(declared_places_kept(disc, turned), 0.0, atol=2e-9)
+    assert_allclose(self_calibration.declared_places_kept(disc, turned), 0.0, atol=2e-9)
 
 
 SHORT = 1e-4  # relative, by which the rig takes all lengths for too short
@@ -145,7 +139,7 @@ def refined(trajectory, rng, size_sigma, misprint=0.0):
     centres[:, :2] += misprint * rng.normal(size=(len(centres), 2))
     disc = replace(trajectory.disc, marker_centres_body=centres)  # as declared: others than those that were seen
     seen = dots_of(trajectory)
-    return true, refine_as_built(replace(seen, rig=small, disc=disc, t=seen.t * (1 - SHORT)))
+    return true, self_calibration.refine_as_built(replace(seen, rig=small, disc=disc, t=seen.t * (1 - SHORT)))
 
 
 def test_regular_dots_correct_a_board_of_unknown_size(trajectory, rng):
@@ -185,10 +179,12 @@ def test_ends_of_a_slow_recording_are_measured_and_an_exchange_there_is_refused(
 def test_dots_are_moved_by_the_share_of_their_displacement_that_is_no_noise(rng):
     sigma = np.full((6, 2), 0.5e-6)
     pattern = rng.normal(size=(6, 2))
-    shares = np.array([share_of_places(MA_2014, size * pattern, sigma) for size in np.geomspace(1e-8, 1e-4, 400)])
+    shares = np.array(
+        [self_calibration.share_of_places(MA_2014, size * pattern, sigma) for size in np.geomspace(1e-8, 1e-4, 400)]
+    )
     assert np.all(np.diff(shares) >= 0)
     assert np.diff(shares).max() < 0.05  # 2.3 % more displacement never tips anything
     assert shares[0] == 0.0
     assert shares[-1] > 0.9999
     moved = 1e-3 + 0.02 * (MA_2014.marker_centres_body[:, :2] @ [[0, 1], [-1, 0]])  # the pattern as a whole
-    assert share_of_places(MA_2014, moved, sigma) == 0.0
+    assert self_calibration.share_of_places(MA_2014, moved, sigma) == 0.0
