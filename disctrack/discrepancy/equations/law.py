@@ -157,12 +157,16 @@ class LearnedForce(search.Explanation):
 
     @cached_property
     def formula(self) -> dict[str, Measured]:
-        """Amounts of the shortest sum of `FORMULAS`; empty if its chi-square to the course is above one per point."""
-        (places, force, covariance), shortest, told = self.course, np.inf, dict[str, Measured]()
+        """Amounts of the shortest sum of `FORMULAS`; empty if its chi-square to the course is above one per point.
+
+        Empty, too, if the course is uncertain enough to be zero everywhere.
+        """
+        (places, force, covariance), told = self.course, dict[str, Measured]()
         if places.ndim > 1 or self.along.period or not np.isfinite(force @ covariance @ force):
             return {}
         root = np.linalg.cholesky(covariance + 1e-9 * np.trace(covariance) / len(force) * np.eye(len(force)))
         right = linalg.solve_triangular(root, force, lower=True)
+        shortest = float(right @ right)  # of none
         usual = list(FORMULAS)[: None if places.min() < 0 < places.max() else -3]
         for names in chain(*(combinations(usual, n) for n in (1, 2, 3))):
             columns = np.stack([FORMULAS[name](places) for name in names], axis=1)

@@ -179,9 +179,8 @@ def test_ends_of_a_slow_recording_are_measured_and_an_exchange_there_is_refused(
 def test_dots_are_moved_by_the_share_of_their_displacement_that_is_no_noise(rng):
     sigma = np.full((6, 2), 0.5e-6)
     pattern = rng.normal(size=(6, 2))
-    shares = np.array(
-        [self_calibration.share_of_places(MA_2014, size * pattern, sigma) for size in np.geomspace(1e-8, 1e-4, 400)]
-    )
+    sizes = np.geomspace(1e-8, 1e-4, 400)
+    shares = np.array([self_calibration.share_of_places(MA_2014, size * pattern, sigma) for size in sizes])
     assert np.all(np.diff(shares) >= 0)
     assert np.diff(shares).max() < 0.05  # 2.3 % more displacement never tips anything
     assert shares[0] == 0.0

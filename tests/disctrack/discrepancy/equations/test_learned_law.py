@@ -2,13 +2,14 @@
 is not claimed where known terms do. Motions come from SciPy's `solve_ivp`."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from disctrack.discrepancy.equations import Equations, Run, diagnose, terms
-from disctrack.discrepancy.equations.law import NAME
+from disctrack.discrepancy.equations.law import NAME, Along, LearnedForce
 
 pytestmark = pytest.mark.statistical
 OSCILLATOR = Equations({"x": "v", "v": "-omega**2*x - 2*beta*v"}, {"omega": 11.5, "beta": 0.12}, units={"x": "m"})
@@ -45,8 +46,7 @@ def recorded(force, seed, sigma=SIGMA):
         lambda t, y: [y[1], -144 * y[0] - 0.3 * y[1] + force(y[0], y[1], t)],
         (0, TIME[-1]), [1.0, 0.0], t_eval=TIME, rtol=1e-9, atol=1e-11, method="LSODA",
     )  # fmt: skip
-    noise = sigma * np.random.default_rng(seed).standard_normal(len(TIME))
-    return Run(TIME, {"x": swing.y[0] + noise}, sigma=sigma)
+    return Run(TIME, {"x": swing.y[0] + sigma * np.random.default_rng(seed).standard_normal(len(TIME))}, sigma=sigma)
 
 
 QUICK = ("a drag that saturates", "a spring of a table", "an odd friction", "a push by time")
@@ -77,12 +77,18 @@ def test_a_law_of_usual_form_is_told_by_its_formula(of, size):
     """Beside what the declared friction lacks: 0.06 v. With the first x the equations have no value at large v."""
     f = {"v |v|": lambda v: v * np.abs(v), "sign v": lambda v: np.tanh(v / 1e-3)}[of]
     limited = {"x": "v", "v": f"{OSCILLATOR.rates['v']} + 1e-9*sqrt(1.2 - x**2 - v**2/144)"}
-    run = recorded(lambda x, v, t: size * f(v), seed=11)
-    law = diagnose(Equations(limited, OSCILLATOR.parameters), run, []).law
+    law = diagnose(Equations(limited, OSCILLATOR.parameters), recorded(lambda x, v, t: size * f(v), seed=11), []).law
     assert law.formula.keys() == {"v", of}
     for function, amount in {"v": -0.06, of: size}.items():
         assert abs(law.formula[function].value - amount) < 3.5 * law.formula[function].sigma < 0.2 * abs(size)
     assert law.text({}).endswith(f"v + ({law.formula[of]}) {of}")
+
+
+def test_of_an_uncertain_course_no_formula_is_told():
+    x = np.linspace(-1, 1, 61)
+    for sigma, told in ((1e-3, {"x²"}), (3.0, set())):
+        seen = SimpleNamespace(course=(x, x**2, sigma**2 * np.eye(61)), along=Along("v", ("x",)))
+        assert LearnedForce.formula.func(seen).keys() == told
 
 
 def test_a_law_of_time_that_fits_first_does_not_keep_a_law_of_the_state_from_being_tried(rng):
@@ -218,8 +224,7 @@ def test_a_law_is_a_force_where_a_mass_matrix_is_declared(rng):
 
 
 def test_the_law_is_told_on_the_page_and_in_json(tmp_path):
-    variable, force = LAWS["a drag that saturates"]
-    assert variable == "v"
+    force = LAWS["a drag that saturates"][1]
     answer = diagnose(OSCILLATOR, recorded(lambda x, v, t: force(v), seed=15), [terms.coulomb("v")])
     assert "a force on v that is a function of v" in " ".join(str(answer).split())
     assert f"{NAME}.a3" not in str(answer)
