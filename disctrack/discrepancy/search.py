@@ -615,6 +615,8 @@ class _Search:
 
     def _alternatives(self, e: Explanation, effect: Candidate) -> list[Alternative]:
         """Effects that predict nearly the same signal, refitted in place of one; they join the explanations."""
+        if not self.system.budget.open(kept=FOR_LAWS):
+            return []
         rest, start = _without(e, effect)
         reduced = _restricted(e.fit, self._quantities(rest))
         linear = Linearisation(self.system, reduced, [*self.candidates, effect])
@@ -628,7 +630,7 @@ class _Search:
         near = [c for c in near if strength * np.sin(angles[c.name]) ** 2 < 4 * CLASS_GAIN + 0.02 * strength]
         near = near[: MOST_ALTERNATIVES if strength < FAINT else MOST_ALTERNATIVES // 2]
         found = []
-        for candidate in near if self.system.budget.open(kept=FOR_LAWS) else ():
+        for candidate in near:
             other = self._explanation((*rest, candidate), start, (candidate,))
             loss = (other.fit.cost - e.fit.cost) / self.noise
             if other.fit.converged and loss < CLASS_GAIN:
