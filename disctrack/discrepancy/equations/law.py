@@ -22,10 +22,10 @@ from scipy.spatial import KDTree
 from calibration.kit.arrays import Array
 from disctrack.discrepancy import search
 from disctrack.discrepancy.equations import shooting
-from disctrack.discrepancy.equations.declared import Equations, Parameter, Term
+from disctrack.discrepancy.equations.declared import Equations, Parameter, Samples, Term
 from disctrack.discrepancy.equations.expressions import Formula
 from disctrack.discrepancy.equations.formulas import Formulas
-from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem
+from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, Prediction
 from disctrack.discrepancy.fit import TRIAL, Fit, fit, no_fit
 from disctrack.discrepancy.held_out import HeldOut, held_out
 from disctrack.discrepancy.noise import outlier_limit, with_autocorrelation
@@ -45,8 +45,7 @@ WORTH = 50.0  # of first-order -2 log evidence over the best law, up to which a 
 ROUGHLY = 4.0  # ... over this multiple of the best, where the declared equations are far from the data
 PLAUSIBLE = 4.0  # of -2 log evidence: a rougher prior may be less probable by so much
 POINTS = (61, 400)  # of the reported course, for one and two variables
-# sums of which tell a law of one variable; the last three where it has both signs
-FORMULAS: Mapping[str, Callable[[Array], Array]] = {
+FORMULAS: Mapping[str, Callable[[Array], Array]] = {  # sums of which tell a law of one variable; of equals the first
     "": np.ones_like, "{0}": np.positive, "{0}²": np.square, "{0}³": lambda x: x * np.square(x), "|{0}|": np.abs,
     "sign {0}": np.sign, "{0} |{0}|": lambda x: x * np.abs(x),
 }  # fmt: skip
@@ -129,9 +128,8 @@ class LearnedForce(search.Explanation):
         law, fitted, own = self.along, self.fit, self.candidate.quantities
         visited, k = _visited(self.system, law.variables, fitted.values), len(law.variables) - 1
         ends = (0.0, law.period) if law.period else (float(visited.min()), float(visited.max()))
-        at = np.linspace(ends[0], ends[1], POINTS[0])[:, None]
-        if k:
-            at = visited[np.linspace(0, len(visited) - 1, POINTS[1]).astype(int)]
+        some = np.linspace(0, len(visited) - 1, POINTS[1]).astype(int)
+        at = visited[some] if k else np.linspace(*ends, POINTS[0])[:, None]
         names = [*(q.name for q in own), *self.held]
         force, columns = _course(self.system, law, names, fitted.values, at)
         # variance of the truncated basis, whose amplitudes fall as the inverse square of the wave number
@@ -165,15 +163,14 @@ class LearnedForce(search.Explanation):
         if places.ndim > 1 or self.along.period or not np.isfinite(force @ covariance @ force):
             return {}
         root = np.linalg.cholesky(covariance + 1e-9 * np.trace(covariance) / len(force) * np.eye(len(force)))
-        right = linalg.solve_triangular(root, force, lower=True)
-        shortest = float(right @ right)  # of none
-        usual = list(FORMULAS)[: None if places.min() < 0 < places.max() else -3]
-        for names in chain(*(combinations(usual, n) for n in (1, 2, 3))):
-            columns = np.stack([FORMULAS[name](places) for name in names], axis=1)
-            matrix = linalg.solve_triangular(root, columns, lower=True)
+        columns = np.column_stack([force, *(f(places) for f in FORMULAS.values())])
+        right, *whitened = linalg.solve_triangular(root, columns, lower=True).T
+        made, shortest = dict(zip(FORMULAS, whitened, strict=True)), float(right @ right)  # of none
+        for names in chain(*(combinations(FORMULAS, n) for n in (1, 2, 3))):
+            matrix = np.stack([made[name] for name in names], axis=1)
             amounts = np.linalg.lstsq(matrix, right)[0]
             left = float(np.sum((right - matrix @ amounts) ** 2))
-            if left < len(right) and (its := left + search.CLASS_GAIN * len(names)) < shortest:
+            if left < len(right) and (its := left + search.CLASS_GAIN * len(names)) < shortest - 1e-3:
                 shortest, sigmas = its, np.sqrt(np.diag(np.linalg.pinv(matrix.T @ matrix)))
                 words = (name.format(self.along.variable) for name in names)
                 told = dict(zip(words, map(Measured, amounts, sigmas), strict=True))
@@ -213,9 +210,8 @@ class LearnedForce(search.Explanation):
         """Its formula, or its course at both ends, in the middle and at its extremes; of two variables at quantiles."""
         places, last = self.variable.reshape(len(self.force), -1), len(self.force) - 1
         order, points = np.argsort(self.force), []
-        shown = order[np.linspace(0, last, 5).round().astype(int)]
-        if places.shape[1] == 1:
-            shown = np.unique([0, last // 2, last, order[0], order[-1]])
+        quantiles = order[np.linspace(0, last, 5).round().astype(int)]
+        shown = quantiles if places.shape[1] > 1 else np.unique([0, last // 2, last, order[0], order[-1]])
         for i in shown:
             place = zip(places[i], self.along.units(units), strict=True)
             where = ", ".join(f"{x:.3g} {unit if unit != '1' else ''}".rstrip() for x, unit in place)
@@ -547,14 +543,17 @@ def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSy
 
 def _visited(system: EquationSystem, variables: Sequence[str], values: Values) -> Array:
     """States, inputs or time (n, k) at the samples of all stretches."""
-    e, found = system.formulas.equations, [np.zeros((0, len(variables)))]
-    for s, motion in system.predictions(values):
-        states = dict(zip(e.states, motion.states.T if motion else [], strict=False))
-        known = {"t": s.time, **dict(zip(e.inputs, system.inputs_of(s), strict=False)), **states}
-        if known.keys() >= {*variables}:
-            found.append(np.stack([known[name] for name in variables], axis=1))
-    everything = np.concatenate(found)
+    everything = np.concatenate([_along(system, variables, s, motion) for s, motion in system.predictions(values)])
     return everything if len(everything) else np.tile([[-1.0], [1.0]], len(variables))
+
+
+def _along(system: EquationSystem, variables: Sequence[str], s: Samples, motion: Prediction | None) -> Array:
+    """States, inputs or time (n, k) at the samples of a stretch; none (0, k) where its motion cannot be integrated."""
+    e = system.formulas.equations
+    states = dict(zip(e.states, motion.states.T if motion else [], strict=False))
+    known = {"t": s.time, **dict(zip(e.inputs, system.inputs_of(s), strict=False)), **states}
+    there = known.keys() >= {*variables}
+    return np.stack([known[name] for name in variables], axis=1) if there else np.zeros((0, len(variables)))
 
 
 def _part_of_law(f: Formulas, law: Along, held: Sequence[str]) -> set[str]:
@@ -577,8 +576,9 @@ def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Va
     """Force (n,) by these parameters, relative to the declared ones, at places (n, k); derivatives (n, names)."""
     f, s = system.formulas, system.stretches[0]
     # other states and inputs as they were near these places: elsewhere the equations may have no value
-    near = KDTree(_visited(replace(system, stretches=(s,)), law.variables, values)).query(at)[1]
     motion = system.predict(values, s)
+    visited = _along(system, law.variables, s, motion)
+    near = KDTree(visited).query(at)[1] if len(visited) else np.zeros(len(at), int)
     states = np.tile(system.start_of(values, s), (len(at), 1)) if motion is None else motion.states[near]
     times = at[:, 0] if law.of_time else np.asarray(np.arange(len(at)) + 0.5, float)
     pieces = np.zeros((len(s.pieces), 5, len(at)))
