@@ -178,8 +178,7 @@ def follow(
     y = np.array(y, assembly.scalar)
     t: complex = grid[0] * y.dtype.type(1.0)
     regime = (len(y) - 8) // 2
-    segments: list[tuple[Records, Array]] = []
-    switches: list[Switch] = []
+    segments, switches = list[tuple[Records, Array]](), list[Switch]()
     end: EndReason | None = None
     i, n_steps = 0, 0
 
@@ -210,8 +209,9 @@ def follow(
                     end = EndReason.CHATTER
     if not segments:  # the motion ends at its start
         add(grid[:1], y[None])
-    now, regimes = (np.concatenate(parts) for parts in zip(*segments, strict=True))
-    return Path(now, regimes, switches, end, t, y, n_steps)
+    parts, regimes = zip(*segments, strict=True)
+    now = np.concatenate([part.view(y.dtype) for part in parts]).view(parts[0].dtype)  # records are copied slowly
+    return Path(now, np.concatenate(regimes), switches, end, t, y, n_steps)
 
 
 def _event_at_start(assembly: Assembly, regime: int, t: complex, y: Numbers) -> int:
