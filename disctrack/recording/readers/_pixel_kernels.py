@@ -3,6 +3,8 @@
 The most significant bit comes first.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from calibration.kit.arrays import AnyArray
@@ -58,25 +60,27 @@ def undo_filters(rows: AnyArray, pixel_bytes: int, out: AnyArray) -> bool:  # pr
     return True
 
 
-@njit(nogil=True, cache=True)
-def unpack_12(packed: AnyArray, out: AnyArray) -> None:  # pragma: no cover (compiled)
-    """3 bytes to 2 pixels: packed (3 k,) uint8, out (2 k,) uint16."""
-    for i in range(out.size // 2):
-        a, b, c = np.uint16(packed[3 * i]), np.uint16(packed[3 * i + 1]), np.uint16(packed[3 * i + 2])
-        out[2 * i] = (a << np.uint16(4)) | (b >> np.uint16(4))
-        out[2 * i + 1] = ((b & np.uint16(0xF)) << np.uint16(8)) | c
+def _unpacker(bits: int) -> Callable[[AnyArray, AnyArray], None]:
+    """Function of packed (n k,) uint8 and out (m k,) uint16: n bytes to m pixels, 5 to 4 (10 bits) or 3 to 2 (12).
+
+    A pixel begins in one byte, `spare` bits later than the one before, and ends in the next. The numbers are constants
+    of the compiled function, which is ten times as fast as one with arguments.
+    """
+    spare, surplus = bits - 8, np.uint16(16 - bits)
+    pixels = 8 // spare
+
+    @njit(nogil=True, cache=True)
+    def unpacked(packed: AnyArray, out: AnyArray) -> None:  # pragma: no cover (compiled)
+        for group in range(out.size // pixels):
+            for i in range(pixels):
+                at = group * (pixels + 1) + i
+                both = (np.uint16(packed[at]) << np.uint16(8)) | np.uint16(packed[at + 1])
+                out[group * pixels + i] = np.uint16(both << np.uint16(spare * i)) >> surplus
+
+    return unpacked
 
 
-@njit(nogil=True, cache=True)
-def unpack_10(packed: AnyArray, out: AnyArray) -> None:  # pragma: no cover (compiled)
-    """5 bytes to 4 pixels: packed (5 k,) uint8, out (4 k,) uint16."""
-    for i in range(out.size // 4):
-        a, b, c = np.uint16(packed[5 * i]), np.uint16(packed[5 * i + 1]), np.uint16(packed[5 * i + 2])
-        d, e = np.uint16(packed[5 * i + 3]), np.uint16(packed[5 * i + 4])
-        out[4 * i] = (a << np.uint16(2)) | (b >> np.uint16(6))
-        out[4 * i + 1] = ((b & np.uint16(0x3F)) << np.uint16(4)) | (c >> np.uint16(4))
-        out[4 * i + 2] = ((c & np.uint16(0xF)) << np.uint16(6)) | (d >> np.uint16(2))
-        out[4 * i + 3] = ((d & np.uint16(0x3)) << np.uint16(8)) | e
+unpack = {bits: _unpacker(bits) for bits in (10, 12)}
 
 
 @njit(nogil=True, cache=True)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from calibration.kit.arrays import AnyArray, Image
 from disctrack.errors import RecordingError, told_as
 from disctrack.files.inputs import open_regular
-from disctrack.recording.readers._pixel_kernels import unpack_10, unpack_12
+from disctrack.recording.readers._pixel_kernels import unpack
 from disctrack.recording.readers.base import FrameReader, in_words, room_for
 
 # Of an image: more than any camera of this kind has, and few enough not to exhaust the memory.
@@ -79,10 +79,8 @@ class RawFile:
         if n < 1:
             raise RecordingError(f"{self} ({camera} camera): its header states no frame. Export it again.")
         if present < LEAST_PRESENT * n or present * layout.frame_bytes > self.size:
-            each = in_words((layout.width, layout.height), layout.stored_bits)
-            said = (
-                f"the header states {n} frames, {each} ({n * layout.frame_bytes} bytes), but the file has {self.size}"
-            )
+            each, total = in_words((layout.width, layout.height), layout.stored_bits), n * layout.frame_bytes
+            said = f"the header states {n} frames, {each} ({total} bytes), but the file has {self.size}"
             remedy = "It is cut short, or the header is of another file: copy both again."
             raise RecordingError(f"{self} ({camera} camera): {said}. {remedy}")
 
@@ -121,7 +119,7 @@ class PixelLayout:
     def decode(self, stored: NDArray[np.uint8], out: Image) -> None:
         """Bytes of one frame (frame_bytes,) into pixels (height, width), contiguous, native uint8 or uint16."""
         if self.packed_bits:
-            (unpack_10 if self.packed_bits == 10 else unpack_12)(stored, out.reshape(-1))
+            unpack[self.packed_bits](stored, out.reshape(-1))
         else:
             rows = stored.reshape(self.height, -1)[:, : self.width * self.dtype.itemsize].view(self.dtype)
             out[...] = rows[::-1] if self.bottom_up else rows
