@@ -4,7 +4,7 @@ from importlib import import_module
 from pathlib import Path
 
 from calibration.kit.arguments import checked
-from disctrack.errors import RecordingError
+from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.files import FORMATS, IMAGES, NUMBER, match_files, split_member
 
@@ -27,10 +27,11 @@ def open_frames(pattern: str, folder: str | Path, camera: str) -> FrameReader:
     module = next(module for module, suffixes in FORMATS.items() if suffix in suffixes)
     if NUMBER in member and suffix not in IMAGES:
         raise RecordingError(f"{files[0]}: {NUMBER} in a pattern numbers images of a file each; leave it out here.")
-    opener = getattr(import_module(f"disctrack.recording.readers.{module}"), f"open_{module}")
+    remedy = "Install it: pip install disctrack[video]"  # the only format of an optional package
+    with told_as(RecordingError, f"{files[0]}: videos need PyAV", ImportError, then=remedy):
+        opener = getattr(import_module(f"disctrack.recording.readers.{module}"), f"open_{module}")
     reader: FrameReader = opener(files, camera, member) if member else opener(files, camera)
     reader.camera = camera
-    reader.notes, reader.doubts = (
-        tuple(f"{camera} camera: {sentence}" for sentence in words) for words in (reader.notes, reader.doubts)
-    )
+    reader.notes = tuple(f"{camera} camera: {note}" for note in reader.notes)
+    reader.doubts = tuple(f"{camera} camera: {doubt}" for doubt in reader.doubts)
     return reader

@@ -1,7 +1,5 @@
 """One camera's frames in a video file (AVI, MP4, MKV, MOV), read through PyAV; needs the extra `disctrack[video]`."""
 
-from __future__ import annotations
-
 import ctypes
 import hashlib
 import threading
@@ -9,9 +7,11 @@ import zlib
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
 
+import av
 import numpy as np
+from av.container import InputContainer
+from av.video.plane import VideoPlane
 from numpy.typing import NDArray
 
 from calibration.kit.arrays import Image
@@ -21,21 +21,16 @@ from disctrack.recording.readers.base import FrameReader, first_readable, only_f
 from disctrack.recording.readers.decoding import as_grey
 from disctrack.recording.readers.raw import MOST_PIXELS, check_frame_size
 
-if TYPE_CHECKING:  # an optional package
-    import av
-    from av.container import InputContainer
-    from av.video.plane import VideoPlane
-
 # Only containers of frames: a play list named like a video could make the library open other files.
 _CONTAINERS = {"format_whitelist": "avi,matroska,webm,mov,mp4,m4a,3gp,3g2,mj2", "protocol_whitelist": "file"}
 _LOSSLESS = frozenset({"ffv1", "rawvideo", "huffyuv", "ffvhuff", "utvideo", "magicyuv", "png", "tiff", "v210", "qtrle"})
 _DECODED_ON = 8  # frames to be skipped by decoding, which is faster than reopening the file and seeking
 
-_Decoded: TypeAlias = "tuple[int, av.VideoFrame | None]"  # index of a frame, the frame; None after the last one
+_Decoded = tuple[int, av.VideoFrame | None]  # index of a frame, the frame; None after the last one
 
 
 def open_video(files: Sequence[Path], camera: str) -> FrameReader:
-    """Reader of one video. Raises RecordingError if PyAV is not installed or the file is not a video.
+    """Reader of one video. Raises RecordingError if the file is not a video.
 
     Grey values are the stored luma plane, not stretched from limited to full range. There are no time stamps: those of
     the container are for a player, not from the camera.
@@ -119,8 +114,6 @@ class _Video:
         After damage, frames up to the next key frame are omitted. Raises RecordingError if the file no longer exists.
         """
         container = _opened(self.file, self.camera)
-        import av
-
         stream, sound = container.streams.video[0], True
         # frames after a fault of the container cannot be found
         with container, suppress(av.FFmpegError, OSError, ValueError):
@@ -152,8 +145,6 @@ def _index(
     The first is True if the times are the container's, False if they are frame numbers. The second is True if packets
     have checksums that the decoder does not enforce. Raises RecordingError.
     """
-    import av
-
     stamps: list[tuple[int | None, int | None, bool]] = []  # of presentation, of decoding; key frame
     checked = False
     with suppress(av.FFmpegError, OSError):  # the file is cut short or damaged there
@@ -196,9 +187,6 @@ def checksums_hold(packet: bytes) -> bool:
 
 
 def _opened(file: Path, camera: str) -> InputContainer:
-    remedy = "Install it: pip install disctrack[video]"
-    with told_as(RecordingError, f"{file}: videos need PyAV", ImportError, then=remedy):
-        import av
     with told_as(RecordingError, f"{file}: not a readable video for the {camera} camera", Exception):
         container = av.open(str(file), options=_CONTAINERS)
         codec = container.streams.video[0].codec_context
@@ -233,11 +221,8 @@ def _format_notes(frame: av.VideoFrame) -> Iterator[str]:
         yield f"luma of {name} (full range) is used as it is"
     elif name.startswith(("yuv", "nv", "p0", "uyvy", "yuyv")):
         yield f"luma of {name} is used as it is, not stretched: limited range has black at 16 and white at 235"
-    if (
-        name.startswith(("yuv4", "yuvj4"))
-        and _depth(frame) == 8
-        and any(np.ptp(_rows(plane, plane.height)[:, : plane.width]) for plane in frame.planes[1:3])
-    ):
+    chroma = frame.planes[1:3] if name.startswith(("yuv4", "yuvj4")) and _depth(frame) == 8 else ()
+    if any(np.ptp(_rows(plane, plane.height)[:, : plane.width]) for plane in chroma):
         yield "the video has colour: its luma is a mixture of what the sensor measured"
 
 
