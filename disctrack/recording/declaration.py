@@ -69,12 +69,11 @@ def _counts(what: str) -> Key:
 
 
 def _are_centres(value: object) -> bool:
-    return (
-        isinstance(value, list)
-        and 3 <= len(value) <= MOST
-        and all(isinstance(dot, list) and len(dot) == 2 for dot in value)
-        and all(_in_range(x, -_FARTHEST, _FARTHEST) for dot in value for x in dot)
-    )
+    return isinstance(value, list) and 3 <= len(value) <= MOST and all(map(_is_centre, value))
+
+
+def _is_centre(dot: object) -> bool:
+    return isinstance(dot, list) and len(dot) == 2 and all(_in_range(x, -_FARTHEST, _FARTHEST) for x in dot)
 
 
 _FARTHEST = 1e4  # [mm] from the disc's centre

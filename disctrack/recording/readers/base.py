@@ -38,16 +38,11 @@ class CameraHeader:
 
     def sentence(self) -> str:
         """The settings in one line."""
-        parts = [self.device, self.rate]
-        if self.exposure is not None:
-            parts.append(f"exposure {1e6 * self.exposure:g} µs")
-        if self.trigger:
-            parts.append(f"trigger {self.trigger}")
-        if self.first_frame is not None:
-            parts.append(f"first frame {self.first_frame}")
-        if self.recorded is not None:
-            parts.append(f"{self.recorded:%Y-%m-%d %H:%M:%S}")
-        return ", ".join(part for part in parts if part)
+        exposure = "" if self.exposure is None else f"exposure {1e6 * self.exposure:g} µs"
+        trigger = f"trigger {self.trigger}" if self.trigger else ""
+        first = "" if self.first_frame is None else f"first frame {self.first_frame}"
+        recorded = "" if self.recorded is None else f"{self.recorded:%Y-%m-%d %H:%M:%S}"
+        return ", ".join(filter(None, (self.device, self.rate, exposure, trigger, first, recorded)))
 
     def as_dict(self) -> dict[str, object]:
         """Entries of the header in JSON types, without the file's path."""

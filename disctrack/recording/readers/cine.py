@@ -6,7 +6,7 @@ file's size before memory is allocated or read.
 """
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -47,6 +47,9 @@ def open_cine(files: Sequence[Path], camera: str) -> FrameReader:
     file.check_announced(camera, layout, n, layout.count_whole(starts, file.size))
     times, step, doubts = _times(cine)
     header = _header(cine, times, step)
+    notes = [header.sentence(), *doubts]
+    if 0 < cine.field("EDRShutterNs") < cine.field("ShutterNs"):
+        notes.append("bright pixels are compressed (extreme dynamic range): edges of the dots may be biased")
     return raw_frames(
         files=[file] * n,
         offsets=_pixels(cine, starts, layout),
@@ -55,7 +58,7 @@ def open_cine(files: Sequence[Path], camera: str) -> FrameReader:
         timestamps=None if times is None else times - times[0],
         frame_rate=header.frame_rate,
         header=header,
-        notes=(header.sentence(), *doubts, *_range_notes(cine)),
+        notes=tuple(notes),
     )
 
 
@@ -77,9 +80,8 @@ class _Cine:
         _, self.width, height, _, self.bits, self.packing, self.image_bytes = bitmap
         self.height = abs(height)
         self.bottom_up = height > 0 and self.packing == 0  # as in a bitmap; packed images begin with the upper row
-        mark_and_length = file.bytes_at(setup_at + 140, 4, f"{file}: camera setup")
-        length = int.from_bytes(mark_and_length[2:], "little")
-        if mark_and_length[:2] != b"ST":
+        mark, length = struct.unpack("<2sH", file.bytes_at(setup_at + 140, 4, f"{file}: camera setup"))
+        if mark != b"ST":
             raise RecordingError(f"{file}: no camera setup where the header says. Export the recording again.")
         self.setup = file.bytes_at(setup_at, length, f"{file}: camera setup")
         self.blocks = setup_at + length  # where they begin
@@ -102,13 +104,13 @@ def _layout(cine: _Cine) -> tuple[PixelLayout, int]:
     check_frame_size(w, h, str(cine.file), packed or cine.bits)
     if packed:
         table = linear_from_10_bits() if packed == 10 else None
-        depth = 12 if packed == 10 else bit_depth_of(12, cine.field("RealBPP") or 12)
+        depth = 12 if packed == 10 else bit_depth_of(12, cine.field("RealBPP"))
         return PixelLayout(w, h, np.dtype("<u2"), packed, table=table), depth
     row = w * cine.bits // 8
     padding = -row % 4  # to a multiple of 4 as in a bitmap, or none, according to the stated size
     padding = padding if cine.image_bytes == (row + padding) * h else 0
     layout = PixelLayout(w, h, np.dtype(f"<u{cine.bits // 8}"), padding=padding, bottom_up=cine.bottom_up)
-    return layout, bit_depth_of(cine.bits, cine.field("RealBPP") or cine.bits)
+    return layout, bit_depth_of(cine.bits, cine.field("RealBPP"))
 
 
 def _pixels(cine: _Cine, starts: NDArray[np.int64], layout: PixelLayout) -> NDArray[np.int64]:
@@ -179,8 +181,7 @@ def _block_of_times(cine: _Cine) -> tuple[int, int] | None:
     for _ in range(1000):  # real files have two or three
         if position + _BLOCK_HEADER.size > min(cine.table, cine.file.size):
             return None
-        content = cine.file.bytes_at(position, _BLOCK_HEADER.size, str(cine.file))
-        size, kind, _ = _BLOCK_HEADER.unpack(content)
+        size, kind, _ = _BLOCK_HEADER.unpack(cine.file.bytes_at(position, _BLOCK_HEADER.size, str(cine.file)))
         if size < _BLOCK_HEADER.size or position + size > cine.file.size:
             return None
         if kind == 1002:
@@ -207,8 +208,3 @@ def _header(cine: _Cine, times: Array | None, step: int) -> CameraHeader:
         locked_clock=bool(second) and not cine.clock_is_free,
         recorded=datetime(1970, 1, 1) + timedelta(seconds=second) if second else None,
     )
-
-
-def _range_notes(cine: _Cine) -> Iterator[str]:
-    if 0 < cine.field("EDRShutterNs") < cine.field("ShutterNs"):
-        yield "bright pixels are compressed (extreme dynamic range): edges of the dots may be biased"

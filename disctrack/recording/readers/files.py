@@ -130,9 +130,8 @@ def number_files(
     numbers, by_number = range(min(column), max(column) + 1, step), dict(zip(column, files, strict=True))
     notes, doubts = [], []
     if missing := _missing(column, step):
-        lost = (
-            f"{len(missing)} file{'s' * (len(missing) > 1)} missing in the sequence, the first is number {missing[0]}"
-        )
+        n, first = len(missing), missing[0]
+        lost = f"{n} file{'s' * (n > 1)} missing in the sequence, the first is number {first}"
         notes.append(f"{lost}; this camera says nothing of these frames")
     if step > 1:
         said = f"the file numbers go in steps of {step}; they are taken as consecutive frames at frame_rate_hz"
@@ -170,10 +169,8 @@ def _numbers_by_form(files: Sequence[Path], camera: str) -> list[list[int]]:
     if all(len(form) == 1 for form in forms):
         said = f"the names of the {camera} frames hold no number, so nothing tells whether one is missing"
         raise RecordingError(f"{_listed(files)}: {said}. Number them as the camera counted them.")
-    groups = Counter(map(tuple, forms)).most_common()
-    if len(groups) > 1:
-        usual = list(groups[0][0])
-        odd = [file for file, form in zip(files, forms, strict=True) if form != usual]
+    usual = [*Counter(map(tuple, forms)).most_common(1)[0][0]]
+    if odd := [file for file, form in zip(files, forms, strict=True) if form != usual]:
         others = [file for file, form in zip(files, forms, strict=True) if form == usual]
         said = f"{_listed(odd)}: not named like the other {len(others)} {camera} frames ({_listed(others)})"
         remedy = f"move it away, or write a pattern that leaves it out; {NUMBER} says which digits count"

@@ -85,7 +85,9 @@ def _open(handle: h5py.File, stack: h5py.Dataset, file: Path) -> FrameReader:
         "timestamps": _timestamps(stack, n, where),
         "frame_rate": rate if rate is not None and rate > 0 else None,
     }
-    whole = _fills_its_bytes(stack)
+    number = stack.id.get_type()
+    # False if a pixel's bits are only a part of its bytes: then the library has to convert them
+    whole = number.get_precision() == 8 * number.get_size() and number.get_offset() == 0
     offset = stack.id.get_offset() if stack.chunks is None and not stack.is_virtual else None
     if offset is not None and whole:
         layout = PixelLayout(width, height, stack.dtype)
@@ -116,12 +118,6 @@ def _frames_stored(stack: h5py.Dataset) -> int:
     if stack.chunks is None:
         return int(stack.id.get_storage_size() // max(1, int(np.prod(stack.shape[1:])) * stack.dtype.itemsize))
     return int(stack.id.get_num_chunks()) * int(stack.chunks[0])
-
-
-def _fills_its_bytes(stack: h5py.Dataset) -> bool:
-    """False if a pixel's bits are only a part of its bytes: then the library has to convert them."""
-    kind = stack.id.get_type()
-    return bool(kind.get_precision() == 8 * kind.get_size() and kind.get_offset() == 0)
 
 
 def _check_other_files(stack: h5py.Dataset, file: Path, where: str) -> None:

@@ -103,10 +103,8 @@ def check_same_numbers(left: FrameReader, right: FrameReader) -> Iterator[str]:
     ours, theirs = left.numbers, right.numbers
     if ours is None or theirs is None or (ours[0], ours.step) == (theirs[0], theirs.step):
         return
-    spans = (
-        f"left files are numbered {ours[0]} to {ours[-1]} in steps of {ours.step}, right ones {theirs[0]} to "
-        f"{theirs[-1]} in steps of {theirs.step}"
-    )
+    one, other = (f"{numbers[0]} to {numbers[-1]} in steps of {numbers.step}" for numbers in (ours, theirs))
+    spans = f"left files are numbered {one}, right ones {other}"
     if ours.step != theirs.step or not (ours[-1] < theirs[0] or theirs[-1] < ours[0]):
         said = f"{left.describe(0)}, {right.describe(0)}: {spans}, but equal numbers must be the same instant"
         raise RecordingError(f"{said}. Copy what is missing, or number the frames of both cameras alike.")
