@@ -134,7 +134,10 @@ def _row(dot: int, rows: tuple[Any, ...], rate: float) -> tuple[float, ...]:
 
 
 _KNOCK = "mount, cable, knock"
-_MISSED, _AGAIN = "the cameras contradict each other on the same dots, throughout", "calibrate again where you record"
+_of_camera = partial(
+    Fault, each="camera", seen="the cameras contradict each other on the same dots, throughout",
+    remedy="calibrate again where you record", named_by=MOVED,
+)  # fmt: skip
 FAULTS = (
     Fault("time_offset", "the right camera exposes later than the left", "synchronisation of the cameras",
           ("delay",), "s", 1e-5, "right minus left", "right_delay_s", bounds=(-0.05, 0.05),
@@ -153,22 +156,18 @@ FAULTS = (
           ("growth",), "1/s", 1e-4, "of the time between frames, relative, per second", "frame_interval_growth",
           bounds=(-0.5, 0.5), of_poses_alone=False, seen="gravity seems to change slowly",
           remedy="trigger by a quartz; let the cameras warm up"),
-    Fault("turned", "the {} camera turned after its calibration", _KNOCK, ("rotation_x", "rotation_y", "rotation_z"),
-          "rad", 1e-5, "in its own axes", "rotation_deg", bounds=(-0.06, 0.06), each="camera",
-          seen=_MISSED, remedy=_AGAIN, named_by=MOVED),
-    Fault("shifted", "the {} camera moved after its calibration", _KNOCK,
-          ("translation_x", "translation_y", "translation_z"), "m", 1e-5, "in its own axes", "translation_mm",
-          bounds=(-0.01, 0.01), each="camera",
-          seen=_MISSED, remedy=_AGAIN, named_by=MOVED),
-    Fault("focal", "the focal length of the {} camera changed", "focus, temperature", ("change",), "1", 1e-5,
-          "relative", "focal_scale", null=1.0, bounds=(-0.05, 0.05), each="camera",
-          seen=_MISSED, remedy=_AGAIN, named_by=MOVED),
-    Fault("principal_point", "the principal point of the {} camera moved", "lens not fixed", ("x", "y"), "px", 0.01,
-          "in the image", "principal_point_change_px", bounds=(-5.0, 5.0), each="camera",
-          seen=_MISSED, remedy=_AGAIN, named_by=MOVED),
-    Fault("distortion", "the distortion of the {} camera changed", "focus, aperture, other lens", ("k1",), "1", 1e-3,
-          "change of Brown's k1", "k1_change", bounds=(-1.0, 1.0), each="camera",
-          seen=_MISSED, remedy=_AGAIN, named_by=MOVED),
+    _of_camera("turned", "the {} camera turned after its calibration", _KNOCK,
+               ("rotation_x", "rotation_y", "rotation_z"), "rad", 1e-5, "in its own axes", "rotation_deg",
+               bounds=(-0.06, 0.06)),
+    _of_camera("shifted", "the {} camera moved after its calibration", _KNOCK,
+               ("translation_x", "translation_y", "translation_z"), "m", 1e-5, "in its own axes", "translation_mm",
+               bounds=(-0.01, 0.01)),
+    _of_camera("focal", "the focal length of the {} camera changed", "focus, temperature", ("change",), "1", 1e-5,
+               "relative", "focal_scale", null=1.0, bounds=(-0.05, 0.05)),
+    _of_camera("principal_point", "the principal point of the {} camera moved", "lens not fixed", ("x", "y"), "px",
+               0.01, "in the image", "principal_point_change_px", bounds=(-5.0, 5.0)),
+    _of_camera("distortion", "the distortion of the {} camera changed", "focus, aperture, other lens", ("k1",), "1",
+               1e-3, "change of Brown's k1", "k1_change", bounds=(-1.0, 1.0)),
     Fault("misprint", "dot {} is not where it was declared", "printing", ("x", "y"), "m", 1e-6, "body axes",
           "misprint_mm", belongs_to=("disc",), along=_of_one_dot, each="dot",
           seen="one dot misses its place in every frame", remedy="measure it on the sheet",
@@ -249,7 +248,7 @@ def scene_faults(disc: Disc, values: Mapping[str, float], rate: float = 1.0) -> 
 
 def values_in_scene(disc: Disc, faults: Faults, rate: float) -> dict[str, float]:
     """Inverse of `scene_faults`: the values that are not null."""
-    pairs = [
-        pair for fault in faults_of(disc) for pair in zip(fault.names(), fault.from_scene(faults, rate), strict=True)
-    ]
-    return {name: float(value) for name, value in pairs if value}
+    found: dict[str, float] = {}
+    for fault in faults_of(disc):
+        found |= zip(fault.names(), map(float, fault.from_scene(faults, rate)), strict=True)
+    return {name: value for name, value in found.items() if value}
