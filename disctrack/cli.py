@@ -53,38 +53,37 @@ TRACEBACK_VARIABLE = "DISCTRACK_TRACEBACK"
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand; returns its exit code. Errors are one line on stderr."""
-    words = list(sys.argv[1:] if argv is None else argv)
     with _interruptions() as received:
-        return _answer(words, received)
+        try:
+            return _run(argv)
+        except KeyboardInterrupt:
+            return _print_interruption(received)
+        except BrokenPipeError:  # the output pipe is closed: `disctrack ... | head`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return FAILED
+        except Exception as error:
+            if os.environ.get(TRACEBACK_VARIABLE):
+                raise
+            return _print_interruption(received) if received else _print_error(error)
 
 
-def _answer(words: Sequence[str], received: Sequence[int]) -> int:
-    try:
-        _escape_unprintable_characters()
-        parser, commands = _parser()
-        arguments, unknown = parser.parse_known_args(words)
-        if unknown:
-            commands.get(arguments.command, parser).error(f"unrecognized arguments: {' '.join(unknown)}")
-        if arguments.command is None:
-            parser.print_help()
-            return USAGE
-        if sys.stderr.isatty():  # the following imports take seconds
-            print(f"{arguments.command} ...", end="\r", file=sys.stderr, flush=True)
-        from disctrack.files.inputs import inputs_kept  # late, so that --help is fast
+def _run(argv: Sequence[str] | None) -> int:
+    _escape_unprintable_characters()
+    parser, commands = _parser()
+    arguments, unknown = parser.parse_known_args(argv)
+    if unknown:
+        commands.get(arguments.command, parser).error(f"unrecognized arguments: {' '.join(unknown)}")
+    if arguments.command is None:
+        parser.print_help()
+        return USAGE
+    if sys.stderr.isatty():  # the following imports take seconds
+        print(f"{arguments.command} ...", end="\r", file=sys.stderr, flush=True)
+    from disctrack.files.inputs import inputs_kept  # late, so that --help is fast
 
-        command = importlib.import_module(f"disctrack.commands.{arguments.command.replace('-', '_')}")
-        with inputs_kept(), catch_warnings():
-            simplefilter("ignore", DoubtWarning)  # reports contain them
-            return int(command.run(arguments) or DONE)
-    except KeyboardInterrupt:
-        return _print_interruption(received)
-    except BrokenPipeError:  # the output pipe is closed: `disctrack ... | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FAILED
-    except Exception as error:
-        if os.environ.get(TRACEBACK_VARIABLE):
-            raise
-        return _print_interruption(received) if received else _print_error(error)
+    command = importlib.import_module(f"disctrack.commands.{arguments.command.replace('-', '_')}")
+    with inputs_kept(), catch_warnings():
+        simplefilter("ignore", DoubtWarning)  # reports contain them
+        return int(command.run(arguments) or DONE)
 
 
 @contextmanager

@@ -177,9 +177,8 @@ def nutation_frequency(theta: float, disc: Disc, gravity: float = 9.81, omega3: 
     moment = I2 * a**2 * c / s - (I3 + m * r * h * c / s) * a * b + m * r * h * a**2 - m * gravity * (r * c - h * s)
     square = -float((moment / step).real) / I1
     if square <= 0:
-        raise ModelError(
-            f"regular precession at {np.degrees(theta):.4g} deg is unstable: there is no nutation oscillation"
-        )
+        unstable = f"regular precession at {np.degrees(theta):.4g} deg is unstable"
+        raise ModelError(f"{unstable}: there is no nutation oscillation")
     return float(np.sqrt(square))
 
 

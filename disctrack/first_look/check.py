@@ -184,16 +184,15 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
             seen.raw += seen.images(pairs, [frames.start])
         if any(Kind.DISC_NOT_FOUND in finding.explains for finding in noticed):
             break  # the images are not of the declared cameras: so are those elsewhere
-    measured = sum(int(tracking.trajectory.measured.sum()) for _, tracking in done)
-    if not done:
-        seen.add(Kind.DISC_NOT_FOUND, "the disc was found nowhere; compare [markers] with the picture", lost)
-    elif measured < total:
-        severity = Severity.DOUBT if 2 * measured < total else Severity.WARNING
-        seen.add(Kind.FRAMES_LOST, f"{total - measured} of {total} frames looked at have no pose", lost, severity)
     noticed = _once(noticed)
     if not done:
+        seen.add(Kind.DISC_NOT_FOUND, "the disc was found nowhere; compare [markers] with the picture", lost)
         seen.findings += with_square(noticed, recording)
         return
+    measured = sum(int(tracking.trajectory.measured.sum()) for _, tracking in done)
+    if measured < total:
+        severity = Severity.DOUBT if 2 * measured < total else Severity.WARNING
+        seen.add(Kind.FRAMES_LOST, f"{total - measured} of {total} frames looked at have no pose", lost, severity)
     seen.seen.append(("dots", f"disc measured in {measured} of {total} frames looked at"))
     for frames, tracking in done:
         row = len(frames) // 2

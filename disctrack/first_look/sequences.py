@@ -2,7 +2,7 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -101,18 +101,16 @@ def pair_cameras(sequences: Iterable[Sequence]) -> list[CameraPair]:
             for other in waiting
             if (difference := _difference(tokens, other, first)) and (_is_side(*difference) or _as_many(other, first))
         ]
-        # a known pair of words first, then numbers, then anything
-        partners.sort(key=lambda item: (not _is_side(*item[1]), not item[1][0].isdigit()))
         if partners:
-            other, (ours, theirs) = partners[0]
+            # a known pair of words first, then numbers, then anything
+            other, words = min(partners, key=lambda item: (not _is_side(*item[1]), not item[1][0].isdigit()))
             waiting.remove(other)
-            named = _is_side(ours, theirs)
-            swap = named and _sides(ours, theirs)[::-1] in _SIDES
-            pairs.append(CameraPair(*((other, first) if swap else (first, other)), named))
+            both = (other, first) if _sides(*words)[::-1] in _SIDES else (first, other)
+            pairs.append(CameraPair(*both, _is_side(*words)))
     return pairs
 
 
-def _image_sequences(folder: Path, inside: Path, names: list[str]) -> list[Sequence]:
+def _image_sequences(folder: Path, inside: Path, names: list[str]) -> Iterator[Sequence]:
     """Images of one folder, grouped by their names without the frame number."""
     by_words: dict[tuple[str, ...], list[list[str]]] = defaultdict(list)
     for name in names:
@@ -128,12 +126,10 @@ def _image_sequences(folder: Path, inside: Path, names: list[str]) -> list[Seque
                 shown[2 * counter + 1] = "*"
             groups["".join(shown), suffix] += 1
     suffixes = [suffix for _, suffix in groups]
-    result = []
     for (pattern, suffix), count in groups.items():
         alone = suffixes.count(suffix) == 1 and "*" in pattern
         shown_pattern = f"*{Path(pattern).suffix}" if alone and inside != Path() else pattern
-        result.append(Sequence(folder, (inside / shown_pattern).as_posix(), suffix, count))
-    return result
+        yield Sequence(folder, (inside / shown_pattern).as_posix(), suffix, count)
 
 
 def _stacks(file: Path) -> list[str]:

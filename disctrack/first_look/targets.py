@@ -26,9 +26,8 @@ def dots_figure(disc: Disc, paper: str = "a4", dark: bool = True) -> Figure:
     diameter = 2e3 * disc.radius
     places = list(_places(width, height, diameter))
     if not places:
-        raise OutputError(
-            f"a disc of {diameter:g} mm does not fit on {paper.upper()} with its ruler. Choose a larger paper."
-        )
+        said = f"a disc of {diameter:g} mm does not fit on {paper.upper()} with its ruler"
+        raise OutputError(f"{said}. Choose a larger paper.")
     figure, axes = _sheet(width, height)
     ink, ground = ("black", "white") if dark else ("white", "black")
     for x, y in places:
