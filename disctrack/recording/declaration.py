@@ -77,6 +77,7 @@ def _is_centre(dot: object) -> bool:
 
 
 _FARTHEST = 1e4  # [mm] from the disc's centre
+_THREE_DOTS = "[[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]"
 _LABEL = _text('text in quotes, e.g. "rec_a"')
 _FILES = _text('a file pattern in quotes, e.g. "left/*.png"')
 _TOLERANCE = _number(0, 2)
@@ -84,10 +85,11 @@ _PART = Key(
     "[x, y, width, height] in pixels, a width and a height above 0",
     lambda value: _whole(value, 4, 0, math.inf) and min(value[2:]) > 0,
 )
+_CORNERS = _counts("inner corners along the long and the short side")
 _VIEW = Key("a whole number from 0 to 100000", lambda value: _whole([value], 1, 0, 100_000))
 _CENTRES = Key(
     f"a list of [x, y] pairs, at least 3 and at most {MOST} of them, each number from {-_FARTHEST:g} to "
-    f"{_FARTHEST:g}, e.g. [[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]",
+    f"{_FARTHEST:g}, e.g. {_THREE_DOTS}",
     _are_centres,
 )
 
@@ -124,17 +126,13 @@ KEYS: dict[str, dict[str, Key]] = {
     },
     "markers": {
         "diameter_mm": _number(0.001, 1e3).like("7.0", "as printed"),
-        "centres_mm": _CENTRES.like(
-            "[[26.0, 0.0], [13.0, 22.5], [-13.0, 22.5]]", "[x, y] of dots from the disc's centre"
-        ),
+        "centres_mm": _CENTRES.like(_THREE_DOTS, "[x, y] of dots from the disc's centre"),
     },
     "calibration": {
         "left": _FILES.like('"calibration/left/*.png"', "views of a chessboard, 15 to 40 of them"),
         "right": _FILES.like('"calibration/right/*.png"', "the same views, in the same order"),
         "target": _one_of(*TARGET_KEYS),
-        "inner_corners": _counts("inner corners along the long and the short side").like(
-            "[9, 6]", "long side first; count them"
-        ),
+        "inner_corners": _CORNERS.like("[9, 6]", "long side first; count them"),
         "square_mm": _number(0.01, 1e4).like("6.0", "side of a square, measured over many squares"),
         "squares": _counts("columns and rows of squares, dark and light"),
         "marker_mm": _number(0.01, 1e4),
