@@ -3,7 +3,7 @@
 import contextlib
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from xml.etree import ElementTree
@@ -75,19 +75,17 @@ def open_mraw(files: Sequence[Path], camera: str) -> FrameReader:
     )
 
 
-def _pair_of(files: Sequence[Path], camera: str) -> tuple[Path, Path]:
-    """Files of header and frames, from one of them or both. If PFV wrote both headers, .cihx is used."""
+def _pair_of(files: Sequence[Path], camera: str) -> Iterator[Path]:
+    """The files of the header and of the frames, from one of them or both. If PFV wrote both headers, .cihx is used."""
     stem = only_file(sorted({file.with_suffix("") for file in files}), camera)
     with told_as(RecordingError, f"{stem.parent}: cannot be read", OSError):
         beside = {file.suffix.lower(): file for file in stem.parent.iterdir() if file.with_suffix("") == stem}
-    found = []
     for suffixes in ((".cihx", ".cih"), (".mraw",)):
         there = [beside[suffix] for suffix in suffixes if suffix in beside]
         if not there:
             said = f"{files[0]}: there is no {stem.name}{' or '.join(suffixes)} beside it for the {camera} camera"
             raise RecordingError(f"{said}. Copy it from the camera's folder, or name exported images instead.")
-        found.append(there[0])
-    return found[0], found[1]
+        yield there[0]
 
 
 Entries = dict[str, str]  # of a header, by their names in the .cih, "" if missing; and "file", its path

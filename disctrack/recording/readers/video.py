@@ -76,7 +76,7 @@ class _Video:
             check_frame_size(codec.width, codec.height, str(file))
             self.codec = str(codec.name)
             # in order of presentation, in units of the container; frame numbers if the times are not usable
-            self.times, self._keys, self._timed, self._checked = _index(container, self.codec, file)
+            self.times, self._keys, self._timed, self._checked = _index(container, file)
 
     def decoded(self, index: int, out: Image | None, where: str) -> Image:
         """Grey values of a frame, in the decoder's memory if `out` is given. Raises RecordingError."""
@@ -137,20 +137,18 @@ class _Video:
                     count += 1
 
 
-def _index(
-    container: InputContainer, codec: str, file: Path
-) -> tuple[NDArray[np.int64], NDArray[np.int64], bool, bool]:
+def _index(container: InputContainer, file: Path) -> tuple[NDArray[np.int64], NDArray[np.int64], bool, bool]:
     """Times of all packets, and the indices at which decoding can begin, including 0; then two flags.
 
     The first is True if the times are the container's, False if they are frame numbers. The second is True if packets
     have checksums that the decoder does not enforce. Raises RecordingError.
     """
     stamps: list[tuple[int | None, int | None, bool]] = []  # of presentation, of decoding; key frame
-    checked = False
+    checked, stream = False, container.streams.video[0]
     with suppress(av.FFmpegError, OSError):  # the file is cut short or damaged there
-        for packet in container.demux(container.streams.video[0]):
+        for packet in container.demux(stream):
             if packet.size:
-                checked = checked or (codec == "ffv1" and checksums_hold(bytes(packet)))
+                checked = checked or (stream.codec_context.name == "ffv1" and checksums_hold(bytes(packet)))
                 stamps.append((packet.pts, packet.dts, bool(packet.is_keyframe)))
     if not stamps:
         raise RecordingError(f"{file}: a video without frames, or damaged. Copy or export it again.")
