@@ -5,6 +5,7 @@ measurement.
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from disctrack.recording.readers.base import FrameReader
 
 
 def run_init(
-    folder: Path, known: Mapping[str, float] | None = None, like: Path | None = None
+    folder: Path, known: Mapping[str, float], like: Path | None
 ) -> tuple[Path, Told, list[str], tuple[str, ...]]:
     """Write recording.toml into a folder of frames. Returns it, values from the files, notes, and keys to fill in.
 
@@ -30,14 +31,13 @@ def run_init(
     for values that the files do not contain
     Raises RecordingError if no two cameras are found, OutputError if there is a recording.toml already.
     """
-    folder = Path(folder)
     file = folder / FILE_NAME
     if file.exists():
         raise OutputError(f"{file}: exists. Edit it, or move it away; `disctrack check {folder}` names what it lacks.")
     example = {} if like is None else read_toml(like / FILE_NAME if like.is_dir() else like, RecordingError)
     found, notes = look_into(folder)
     given = {"gravity": {"g_m_s2": 9.81}} | example
-    text, missing = declaration_text(folder.resolve().name, found, known or {}, given)
+    text, missing = declaration_text(folder.resolve().name, found, known, given)
     write_whole(file, text.encode())
     return file, found, notes, missing
 
@@ -170,9 +170,7 @@ def _rig_near(folder: Path) -> str | None:
     """A rig file of disctrack in the folder or its parent."""
     for place, shown in ((folder, ""), (folder.parent, "../")):
         for file in sorted(place.glob("*.h5")):
-            try:
+            with suppress(DiscTrackError):
                 read_rig(file)
-            except DiscTrackError:
-                continue
-            return f"{shown}{file.name}"
+                return f"{shown}{file.name}"
     return None
