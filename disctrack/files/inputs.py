@@ -7,6 +7,7 @@ import contextlib
 import errno
 import glob
 import os
+import re
 import stat
 import tomllib
 from collections.abc import Iterator
@@ -124,8 +125,8 @@ def _patterns(file: Path) -> list[str]:
     found = [glob.escape(str(file))]
     with contextlib.suppress(OSError, ValueError, RecursionError, AttributeError):  # AttributeError: no text there
         declared = tomllib.loads(read_regular(file, MOST_TEXT).decode())
-        for section, keys in (("cameras", ("left", "right")), ("calibration", ("left", "right", "rig"))):
-            for name in filter(None, map(declared.get(section, {}).get, keys)):
-                below = os.path.join(glob.escape(str(file.parent)), name.replace("{number}", "*"))
-                found.append(os.path.normpath(below))
+        for value in (*declared.get("cameras", {}).values(), *declared.get("calibration", {}).values()):
+            if isinstance(value, str):
+                name = re.sub(r"(?<=..):/.*", "", value.replace("{number}", "*"))  # without the data set in a file
+                found.append(os.path.normpath(os.path.join(glob.escape(str(file.parent)), name)))
     return [os.path.normcase(pattern) for pattern in found]

@@ -86,6 +86,8 @@ def test_a_file_is_read_up_to_its_bound(tmp_path):
         ("a/b/c/d/left/*.png", "a/b/c/d/left/trajectory.h5", "lies among the frames"),  # however far below
         ("left_*.png", "trajectory.h5", ""),  # frames in the recording's own folder
         ("left_*.png", "left_1.png", "no output replaces an input"),
+        ("left_1.png:/left", "left_1.png", "no output replaces an input"),  # a data set of a file
+        ("left/*.png", "flat/trajectory.h5", "lies among the frames"),
     ],
 )
 def test_a_result_among_frames_or_views_is_refused_and_one_beside_or_below_them_is_not(
@@ -94,7 +96,7 @@ def test_a_result_among_frames_or_views_is_refused_and_one_beside_or_below_them_
     (tmp_path / "rec").mkdir()
     (tmp_path / "rec" / "left_1.png").touch()
     (tmp_path / "rec" / "recording.toml").write_text(
-        f'[cameras]\nleft = "{frames}"\nright = "right/*.png"\n'
+        f'[cameras]\nleft = "{frames}"\nright = "right/*.png"\nright_flat = "flat/*.png"\n'
         '[calibration]\nleft = "views/left_*.png"\nrig = "../r.h5"\n'
     )
     with pytest.raises(OutputError, match=refused) if refused else contextlib.nullcontext():
