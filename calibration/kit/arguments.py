@@ -140,9 +140,8 @@ def _collection(value: Any, kind: type, parts: tuple[Any, ...]) -> Any:
             raise TypeError
         return tuple(_fit(v, part) for v, part in zip(value, parts, strict=True))
     listed = isinstance(value, list | tuple | np.ndarray) and issubclass(tuple, kind)
-    if not listed and (not isinstance(value, kind) or isinstance(value, str | bytes)):
-        raise TypeError
-    if isinstance(value, Mapping) != issubclass(kind, Mapping):
+    fits = listed or (isinstance(value, kind) and not isinstance(value, str | bytes))
+    if not fits or isinstance(value, Mapping) != issubclass(kind, Mapping):
         raise TypeError
     if listed and parts:
         members = [_fit(member, parts[0]) for member in value]

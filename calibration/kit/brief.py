@@ -43,15 +43,13 @@ LONGEST = 60  # characters of a text that is shown whole
 
 
 def _outlined(value: Any) -> str:
-    if value is None or (isinstance(value, (str, tuple, list, Mapping)) and not value):
-        return ""
-    if isinstance(value, np.ndarray):
-        return " x ".join(map(str, value.shape)) if value.ndim else f"{value:.6g}"
-    if isinstance(value, float):
+    if isinstance(value, np.ndarray) and value.ndim:
+        return " x ".join(map(str, value.shape))
+    if isinstance(value, (float, np.ndarray)):
         return f"{value:.6g}"
     if isinstance(value, (tuple, list, Mapping)):
-        return str(len(value))
+        return str(len(value) or "")
     if isinstance(value, (str, Path, Enum, bool, int)):
         text = value.name if isinstance(value, Enum) else str(value)
         return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
-    return type(value).__name__
+    return "" if value is None else type(value).__name__

@@ -7,7 +7,6 @@ values. A sensor with a colour filter may also write grey images, with a pattern
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.kit.arrays import AnyArray
 
@@ -31,20 +30,9 @@ def level_step(image: AnyArray) -> int:
 
 def full_scale(image: AnyArray) -> int:
     """Largest grey value of the camera, with the fewest bits, but at least 8, that the image needs."""
-    if image.dtype == np.uint8:
-        return 255
     step = level_step(image)
     bits = max(8, int(image.max() // step).bit_length())
     return step * (2**bits - 1)
-
-
-def _counts(images: AnyArray) -> NDArray[np.int64]:
-    """Number of pixels with each grey value, up to the largest."""
-    bins = int(images.max()) + 1 if images.size else 1  # cv2 is ten times as fast as bincount, and counts in singles
-    counts = np.zeros(bins, np.int64)
-    for image in np.atleast_2d(images).reshape(-1, *np.atleast_2d(images).shape[-2:]):
-        counts += cv2.calcHist([np.ascontiguousarray(image)], [0], None, [bins], [0, bins]).ravel().astype(np.int64)
-    return counts
 
 
 def saturation_level(images: AnyArray) -> int | None:
@@ -53,7 +41,10 @@ def saturation_level(images: AnyArray) -> int | None:
     images : any shape, uint8 or uint16; better detected in several images of a recording. None if it is not detected:
     then hardly any pixel is saturated.
     """
-    counts = _counts(images)
+    bins = int(images.max(initial=0)) + 1
+    counts = np.zeros(bins, np.int64)  # of pixels; cv2 is ten times as fast as bincount, and counts in singles
+    for image in images.reshape(-1, *images.shape[-2:]):
+        counts += cv2.calcHist([np.ascontiguousarray(image)], [0], None, [bins], [0, bins]).ravel().astype(np.int64)
     levels = np.flatnonzero(counts)
     if len(levels) < _ENOUGH_LEVELS or counts[-1] < _PILE_PIXELS:
         return None

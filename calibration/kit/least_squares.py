@@ -52,8 +52,7 @@ class Normal:
         """(n, k, k) information of the own parameters, with a one on the diagonal for those without data."""
         own = self.products[:, : self.k, : self.k]
         diagonal = np.einsum("nii->ni", own)
-        held: Array = own + (damping * diagonal + (diagonal == 0.0))[..., None] * np.eye(self.k)
-        return held
+        return np.asarray(own + (damping * diagonal + (diagonal == 0.0))[..., None] * np.eye(self.k), float)
 
     def carried(self, damping: float = 0.0) -> Array:
         """(n, k, s + 1) response of the own parameters to the shared ones, and their step at fixed shared ones."""
@@ -65,8 +64,7 @@ class Normal:
         total = self.products[:, k:, k:].sum(0) + self.prior
         total[:-1, :-1] += damping * np.diag(np.diag(total)[:-1])
         width = len(total)
-        result: Array = total - self.products[:, :k, k:].reshape(-1, width).T @ carried.reshape(-1, width)
-        return result
+        return total - self.products[:, :k, k:].reshape(-1, width).T @ carried.reshape(-1, width)
 
     def step(self, damping: float = 0.0) -> tuple[Array, Array]:
         """Damped step of the shared parameters (s,) and of the own ones (n, k)."""
@@ -279,8 +277,6 @@ def covariance_within(matrix: Array, right: Array, x: Array, lower: Array, upper
     others = np.flatnonzero(outwards == 0)
     covariance[np.ix_(others, others)] = _covariance(matrix[:, others])
     held = held[sigma[held] > 0]
-    if held.size == 0:
-        return covariance
     beyond = outwards[held] * (free @ (matrix.T @ right))[held] / sigma[held]
     share = np.array([_within_bound(float(t)) for t in beyond])
     across = np.zeros((k, held.size))

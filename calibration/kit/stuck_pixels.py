@@ -54,10 +54,8 @@ def repaired_views(views: Sequence[AnyArray], camera: str) -> tuple[list[AnyArra
     views : grey (height, width) or colour (height, width, channels), of one size and type; channels are independent.
     With a colour filter each value is interpolated from several pixels, so that a stuck one affects its neighbours.
     """
-    first = views[0] if len(views) else np.zeros((0, 0))
-    if any(view.shape != first.shape or view.dtype not in (np.uint8, np.uint16) for view in views) or first.ndim > 3:
-        return list(views), ""
-    blind = stuck_pixels(views, of_board=True)
+    alike = all(view.shape == views[0].shape and view.dtype in (np.uint8, np.uint16) for view in views)
+    blind = stuck_pixels(views, of_board=True) if alike and all(view.ndim <= 3 for view in views) else None
     if blind is None:
         return list(views), ""
     mended = [view.copy() for view in views]
