@@ -150,15 +150,11 @@ def normal_equations(image, window, p, known, noise, weights, first_pass, H, g):
             chi2 = residual * residual * weight
             sums[0] += chi2
             sums[1] += 1.0
-            level = S if p[6] > 0 else -S
-            if level < -FLAT:
-                sums[2] += residual * residual
-                sums[3] += model
-                sums[4] += 1.0
-            elif level > FLAT:
-                sums[5] += residual * residual
-                sums[6] += model
-                sums[7] += 1.0
+            if abs(S) > FLAT:
+                at = 5 if (S > 0.0) == (p[6] > 0.0) else 2  # sums of light squares, or of dark ones
+                sums[at] += residual * residual
+                sums[at + 1] += model
+                sums[at + 2] += 1.0
             else:
                 sums[8] += chi2
     return sums

@@ -78,7 +78,7 @@ def fit_view(grey: Array, rough: Array, inner_corners: tuple[int, int], seen: Ma
         axes = local_axes(points, ok, inner_corners)
         bends = _line_curvature(points, ok, found[:, 2:4], inner_corners)
         known = np.concatenate([bends, _contrast_gradient(points, ok, found[:, 5:7])], axis=1)
-    _mend_with_smaller_windows(grey, fit, windows, starts, known, noise)
+    _mend_by_smaller_windows(grey, fit, windows, starts, known, noise)
     return _judged(grey, fit, axes, rough, inner_corners, seen, plain)
 
 
@@ -88,14 +88,11 @@ _Fit = tuple[Array, Array, Array, Mask]  # what the kernel returns for the corne
 def _chi_square(fit: _Fit) -> Array:
     """Reduced chi-square over the whole window (n,); inf without a fit."""
     _, _, sums, converged = fit
-    with np.errstate(invalid="ignore", divide="ignore"):
-        value = sums[:, 0] / np.maximum(sums[:, 1] - N_CORNER, 1.0)
+    value = sums[:, 0] / np.maximum(sums[:, 1] - N_CORNER, 1.0)
     return np.where(converged & np.isfinite(value), value, np.inf)
 
 
-def _mend_with_smaller_windows(
-    grey: Array, fit: _Fit, windows: Array, starts: Array, known: Array, noise: Array
-) -> None:
+def _mend_by_smaller_windows(grey: Array, fit: _Fit, windows: Array, starts: Array, known: Array, noise: Array) -> None:
     """Repeat fits, in place, with smaller windows if something else lies in the window, such as a dirty square."""
     for factor in (0.6, 0.35):
         chi_square = _chi_square(fit)
@@ -116,21 +113,18 @@ def _windows(points: Array, axes: Array, blur: float, shape: tuple[int, ...], pl
     most : [px] largest half width across an edge
     """
     A = np.swapaxes(axes, 1, 2)  # columns are the images of i and j
-    inverse = np.linalg.inv(A)
-    area = np.abs(np.linalg.det(A))
-    lengths = np.linalg.norm(axes, axis=-1)
+    area, lengths = np.abs(np.linalg.det(A)), np.linalg.norm(axes, axis=-1)
     between = area[:, None] / lengths[:, ::-1]  # distance of neighbouring parallel edges, across them [px]
-    half = np.clip(1.0 - (EDGE_MARGIN * blur + 0.7) / between, MIN_WINDOW, MAX_WINDOW)
-    half = np.minimum(half, most / between)
-    reach = np.abs(A * half[:, None, :]).sum(-1)
-    low, high = np.ceil(points - reach), np.floor(points + reach)
-    size = np.array([shape[1], shape[0]])
-    low, high = np.clip(low, 0, size - 1), np.clip(high, -1, size - 1)
-    step = 0.5 * between.min(axis=1)
-    box = [low[:, 0], high[:, 0], low[:, 1], high[:, 1], points, inverse.reshape(-1, 4), half, step]
-    near = (EDGE_MARGIN * blur + 0.7) / between.min(axis=1)  # excludes the blurred edge of the marker
-    clear = np.where(np.abs(plain) < 1, np.maximum(np.abs(plain) - near, 0.5 * np.abs(plain)), 1.0)
-    return np.column_stack([*box, clear * np.sign(plain)])
+    blurred = (EDGE_MARGIN * blur + 0.7) / between
+    half = np.minimum(np.clip(1.0 - blurred, MIN_WINDOW, MAX_WINDOW), most / between)
+    reach, last = np.abs(A * half[:, None, :]).sum(-1), np.array(shape[::-1]) - 1
+    low, high = np.clip(np.ceil(points - reach), 0, last), np.clip(np.floor(points + reach), -1, last)
+    sides = np.stack([low, high], axis=-1).reshape(-1, 4)
+    # excludes the blurred edge of the marker
+    clear = np.where(np.abs(plain) < 1, np.maximum(np.abs(plain) - blurred.max(1), 0.5 * np.abs(plain)), 1.0)
+    largest_step = 0.5 * between.min(axis=1)
+    inverse = np.linalg.inv(A).reshape(-1, 4)
+    return np.column_stack([sides, points, inverse, half, largest_step, clear * np.sign(plain)])
 
 
 def _starts(grey: Array, points: Array, axes: Array, blur: float, aside: float) -> Array:
@@ -224,8 +218,7 @@ def _judged(
     found, by_noise, sums, ended = fit
     spacing = float(np.median(np.linalg.norm(axes, axis=-1)))
     edge_pixels = sums[:, 1] - sums[:, 4] - sums[:, 7]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        chi_square = sums[:, 8] / np.maximum(edge_pixels, 1.0)
+    chi_square = sums[:, 8] / np.maximum(edge_pixels, 1.0)
     converged = ended & np.isfinite(by_noise).all((1, 2)) & seen
     spread = float(np.median(chi_square[converged])) if converged.any() else 1.0
     chi_limit = MAX_CHI_SQUARE * max(spread, 1.0)  # compressed images have correlated noise: relative to the view
@@ -267,8 +260,7 @@ def saddle_points(grey: Array, points: Array, spacing: float) -> Array:
     found = np.array(points, np.float32)
     inside = ((found >= 0) & (found < np.array(grey.shape[::-1], np.float32))).all(axis=1)
     if inside.any():
-        start = np.ascontiguousarray(found[inside]).reshape(-1, 1, 2)
-        found[inside] = cv2.cornerSubPix(image, start, (half, half), (-1, -1), (3, 60, 1e-4)).reshape(-1, 2)
+        found[inside] = cv2.cornerSubPix(image, found[inside], (half, half), (-1, -1), (3, 60, 1e-4))
     return found.astype(float)
 
 
@@ -318,7 +310,6 @@ def smooth_grid(points: Array, inner_corners: tuple[int, int], seen: Mask) -> tu
     A = np.stack([u**a * v**b for a in range(degree + 1) for b in range(degree + 1 - a)], axis=-1)
     target = points - plane
     weight = seen.astype(float)
-    scale = np.inf
     for _ in range(10):
         root = np.sqrt(weight)[:, None]
         coefficients = np.linalg.lstsq(A * root, target * root, rcond=None)[0]
