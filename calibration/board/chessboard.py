@@ -32,6 +32,9 @@ class BoardNotFound:
     reason: str
 
 
+Located = CornerView | BoardNotFound  # in an image
+
+
 def luminance(image: AnyArray) -> tuple[AnyArray, tuple[str, ...]]:
     """Grey values (h, w) of an image as cv2.IMREAD_UNCHANGED returns it, and a note if information was discarded.
 
@@ -51,7 +54,7 @@ def luminance(image: AnyArray) -> tuple[AnyArray, tuple[str, ...]]:
 
 
 @checked
-def find_corners(image: AnyArray, inner_corners: tuple[int, int], thorough: bool = True) -> CornerView | BoardNotFound:
+def find_corners(image: AnyArray, inner_corners: tuple[int, int], thorough: bool = True) -> Located:
     """Locate the inner corners of a chessboard.
 
     image : (h, w) or (h, w, 3) uint8 or uint16, blue-green-red order as OpenCV reads it; see `luminance`
@@ -61,12 +64,11 @@ def find_corners(image: AnyArray, inner_corners: tuple[int, int], thorough: bool
     grey, notes = luminance(image)
     start = _rough_corners(as_8_bit(grey), inner_corners, thorough)
     if start is None:
-        columns, rows = inner_corners
         return BoardNotFound(
-            f"no board of {columns} x {rows} inner corners: it must be wholly in view with a light rim round it, "
-            "and the counts must be those of the INNER corners"
+            f"no board of {inner_corners[0]} x {inner_corners[1]} inner corners: it must be wholly in view with a "
+            "light rim round it, and the counts must be those of the INNER corners"
         )
-    view = _view_at(start, np.ascontiguousarray(grey, dtype=np.float64), inner_corners)
+    view = _view_at(start, grey, inner_corners)
     return view if isinstance(view, BoardNotFound) else replace(view, notes=notes)
 
 
@@ -79,18 +81,17 @@ def board_in(grey: AnyArray, thorough: bool = False) -> tuple[int, int] | None:
     found, corners, squares = cv2.findChessboardCornersSBWithMeta(as_8_bit(grey), (3, 3), flags)
     if not found or squares is None or squares.size < LEAST_CORNERS:
         return None
-    rows, columns = squares.shape[:2]
-    points = np.asarray(corners, np.float64).reshape(rows, columns, 2)
-    if rows > columns:
-        rows, columns, points = columns, rows, points.transpose(1, 0, 2)
-    if not _even(points):
-        return None
-    view = _view_at(points.reshape(-1, 2), np.ascontiguousarray(grey, dtype=np.float64), (columns, rows))
-    return None if isinstance(view, BoardNotFound) else (columns, rows)
+    grid = np.asarray(corners, np.float64).reshape(*squares.shape[:2], 2)
+    if len(grid) > grid.shape[1]:
+        grid = grid.swapaxes(0, 1)
+    size = grid.shape[1], grid.shape[0]
+    whole = _even(grid) and isinstance(_view_at(grid.reshape(-1, 2), grey, size), CornerView)
+    return size if whole else None
 
 
-def _view_at(start: Array, values: Array, inner_corners: tuple[int, int]) -> CornerView | BoardNotFound:
+def _view_at(start: Array, grey: AnyArray, inner_corners: tuple[int, int]) -> Located:
     """Corners of the view; `start` (n, 2) is their position to about a pixel, in any order of the board."""
+    values = np.ascontiguousarray(grey, dtype=np.float64)
     rough = _orient(start, values, inner_corners)
     if isinstance(rough, BoardNotFound):
         return rough
@@ -100,16 +101,13 @@ def _view_at(start: Array, values: Array, inner_corners: tuple[int, int]) -> Cor
             f"only {view.accepted.sum()} of {len(view.accepted)} corners lie on a regular grid: the board is covered "
             f"or bent, or {inner_corners[0]} x {inner_corners[1]} is not the number of its inner corners"
         )
-    beyond = _larger_board(values, view, inner_corners)
-    return BoardNotFound(beyond) if beyond else view
+    return _if_whole(view, values, inner_corners)
 
 
 def as_8_bit(grey: AnyArray) -> NDArray[np.uint8]:
     """Grey values stretched to 8 bit, for the rough search only."""
-    if grey.dtype == np.uint8:
-        return grey
-    if grey.dtype == np.uint16 and grey.max() < 256:
-        return grey.astype(np.uint8)
+    if grey.dtype.kind == "u" and grey.max(initial=0) < 256:
+        return grey.astype(np.uint8, copy=False)
     low, high = np.percentile(grey, [0.5, 99.5])
     return np.clip((grey - low) * (255.0 / max(high - low, 1e-12)), 0, 255).astype(np.uint8)
 
@@ -158,21 +156,17 @@ def _orient(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> Arra
     i_px, j_px = grid[:, 1:].mean((0, 1)) - grid[:, :-1].mean((0, 1)), grid[1:].mean((0, 1)) - grid[:-1].mean((0, 1))
     if i_px[0] * j_px[1] - i_px[1] * j_px[0] > 0:  # y points down in the image: i x j must come out of the print
         grid = grid[::-1] if columns != rows else grid.transpose(1, 0, 2)
-    corners = grid.reshape(-1, 2)
-    orders = board_orders(inner_corners)
-    signs = [_first_square_is_dark(corners[order], grey, inner_corners) for order in orders]
+    ordered = [grid.reshape(-1, 2)[order] for order in board_orders(inner_corners)]
+    signs = [_first_square_is_dark(corners, grey, inner_corners) for corners in ordered]
     if max(abs(sign) for sign in signs) < MIN_ALTERNATION:
         return BoardNotFound(
             f"the squares between the corners found are not light and dark in turn: {columns} x {rows} is not the "
             "number of the board's inner corners, or it is no chessboard"
         )
-    dark = [corners[order] for order, sign in zip(orders, signs, strict=True) if sign > 0]
+    dark = [corners for corners, sign in zip(ordered, signs, strict=True) if sign > 0]
     # if the colouring allows several orders, i points right in this image; the stereo pair makes the cameras agree.
     # With such counts all corner squares may be light, if the print begins with a light one
-    return max(
-        dark or [corners[order] for order in orders],
-        key=lambda c: float((c[columns - 1] - c[0]) @ np.array([1.0, -1e-3])),
-    )
+    return max(dark or ordered, key=lambda c: float((c[columns - 1] - c[0]) @ [1.0, -1e-3]))
 
 
 def _first_square_is_dark(corners: Array, grey: Array, inner_corners: tuple[int, int]) -> float:
@@ -188,8 +182,8 @@ def _first_square_is_dark(corners: Array, grey: Array, inner_corners: tuple[int,
     return float(-np.nansum(signs) / signs.size)
 
 
-def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int]) -> str | None:
-    """A message if full lines of corners continue beyond a side: the board is larger than declared."""
+def _if_whole(view: CornerView, grey: Array, inner_corners: tuple[int, int]) -> Located:
+    """The view, unless full lines of corners continue beyond a side: the board is larger than declared."""
     columns, rows = inner_corners
     grid = view.points.reshape(rows, columns, 2)
     axes = local_axes(view.points, view.accepted, inner_corners)
@@ -202,9 +196,9 @@ def _larger_board(grey: Array, view: CornerView, inner_corners: tuple[int, int])
         while _crosses(grey, line + step, np.rot90(axes, side)[0], least):
             line, further[side % 2] = line + step, further[side % 2] + 1
     if not any(further):
-        return None
+        return view
     all_columns, all_rows = columns + further[1], rows + further[0]
-    return (
+    return BoardNotFound(
         f"the board goes on beyond the {columns} x {rows} inner corners that were declared: {all_columns} x {all_rows} "
         f"are in view. If that is all of them, declare inner_corners = [{all_columns}, {all_rows}]; a part of a board "
         "cannot be distinguished from its neighbour, one square further on"
@@ -228,16 +222,13 @@ def _saddles(grey: Array, points: Array, axes: Array, aside: float = 0.3) -> Arr
     return np.where(lighter > 0, lighter, -np.maximum(darker, 0.0))
 
 
-def negatives(images: Sequence[AnyArray], views: Sequence[CornerView | BoardNotFound], board: Board) -> str:
+def negatives(images: Sequence[AnyArray], views: Sequence[Located], board: Board) -> str:
     """Reason for which images of a chessboard appear to be negatives, in words; "" if there is none.
 
     The pattern itself gives no evidence: the colouring of a negative is that of the board turned by 180 deg.
     """
-    dark = [
-        margin_is_dark(image, view, board.inner_corners)
-        for image, view in zip(images, views, strict=True)
-        if isinstance(view, CornerView)
-    ]
+    pairs = zip(images, views, strict=True)
+    dark = [margin_is_dark(image, view, board.inner_corners) for image, view in pairs if isinstance(view, CornerView)]
     if not dark or np.mean(dark) <= 0.5:
         return ""
     return (
@@ -257,6 +248,3 @@ def margin_is_dark(image: AnyArray, view: CornerView, inner_corners: tuple[int, 
     light, dark = np.nanquantile(grey_at(image, 0.5 * (grid[1:, 1:] + grid[:-1, :-1])), [0.8, 0.2])
     seen = np.isfinite(margin)
     return bool(seen.mean() > 0.5 and np.median(margin[seen]) < dark + 0.25 * (light - dark))
-
-
-__all__ = ["BoardNotFound", "CornerView", "board_in", "board_orders", "find_corners", "luminance", "negatives"]

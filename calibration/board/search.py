@@ -1,19 +1,11 @@
 """Search for a calibration target in many images; if it is missing, search for the board that they show instead."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 from calibration.board.charuco import find_charuco
-from calibration.board.chessboard import (
-    SEARCH_SIZE,
-    BoardNotFound,
-    CornerView,
-    board_in,
-    find_corners,
-    luminance,
-    reduced,
-)
+from calibration.board.chessboard import SEARCH_SIZE, BoardNotFound, Located, board_in, find_corners, luminance, reduced
 from calibration.board.target import Board, Target
 from calibration.kit.arrays import AnyArray, evenly
 
@@ -23,31 +15,27 @@ SIZES_TRIED = 3  # most frequent board sizes that are tested
 VIEWS_TRIED = 8  # sample of a set of images; if it shows no board, the slow search of the others is skipped
 
 
-def located(
-    images: Sequence[AnyArray], target: Target, progress: Progress | None = None
-) -> list[CornerView | BoardNotFound]:
+def located(images: Sequence[AnyArray], target: Target, progress: Progress | None = None) -> list[Located]:
     """The target in every image.
 
     The quick search is tried in all images, the slow one in those without a result. The search ends early if a sample
     of the images shows another board, or if the quick search found nothing and the slow one fails in a sample.
     """
-    views: dict[int, CornerView | BoardNotFound] = {}
+    views: dict[int, Located] = {}
 
     def locate(index: int, thorough: bool) -> None:
-        is_new, image = index not in views, images[index]
         try:
             if isinstance(target, Board):
-                views[index] = find_corners(image, target.inner_corners, thorough)
+                views[index] = find_corners(images[index], target.inner_corners, thorough)
             else:
-                views[index] = find_charuco(image, target)
+                views[index] = find_charuco(images[index], target)
         except ValueError as error:
             views[index] = BoardNotFound(str(error))
-        if progress and is_new:
+        if progress and not thorough:
             progress("corners", len(views), len(images))
 
-    def lost(among: Iterable[int], thorough: bool) -> list[int]:
+    def lost(indices: list[int], thorough: bool) -> list[int]:
         """Images in which it is not found."""
-        indices = list(among)
         with ThreadPoolExecutor(2) as pool:  # OpenCV and the fit of corners release the interpreter lock
             list(pool.map(locate, indices, [thorough] * len(indices)))
         return [index for index in indices if isinstance(views[index], BoardNotFound)]
@@ -56,7 +44,7 @@ def located(
     without = lost(sample, False)
     if shown := other_board([images[i] for i in sample], [i in without for i in sample], target):
         return [BoardNotFound(f"{target} is not in it. {shown}")] * len(images)
-    without += lost(sorted(set(range(len(images))) - set(sample)), False)
+    without += lost([i for i in range(len(images)) if i not in sample], False)
     tried = without if len(without) < len(images) else sample
     if lost(tried, True) != tried:
         lost([i for i in without if i not in tried], True)
@@ -74,7 +62,7 @@ def other_board(images: Sequence[AnyArray], refused: Sequence[bool], target: Tar
     size, _ = board_size([without[i] for i in evenly(len(without), VIEWS_TRIED // 2)], SEARCH_SIZE // 2)
     if size is None or size == target.inner_corners:
         return ""
-    seen = sum(isinstance(find_corners(image, size, thorough=False), CornerView) for image in images)
+    seen = sum(not isinstance(find_corners(image, size, thorough=False), BoardNotFound) for image in images)
     if seen < max(LEAST_VIEWS, 2 * (len(images) - len(without)), len(images) / 3):
         return ""
     return f"{seen} of {len(images)} images looked at show {size[0]} x {size[1]}: inner_corners = {list(size)}"

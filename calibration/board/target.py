@@ -29,7 +29,7 @@ class Board:
     square: float  # side of a square [m]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "inner_corners", _counts(self.inner_corners, 3, "inner corners of a chessboard"))
+        _require(self.inner_corners, 3, "inner corners of a chessboard")
         if not (np.isfinite(self.square) and self.square > 0):
             raise CalibrationError(f"the side of a square must be positive, got {self.square} m")
 
@@ -59,6 +59,7 @@ def board_orders(inner_corners: tuple[int, int]) -> list[Indices]:
     return [np.rot90(index, k).ravel() for k in turns]
 
 
+@checked
 @dataclass(frozen=True)
 class CharucoBoard:
     """A chessboard with an ArUco marker in every light square; points are its inner corners in OpenCV's order.
@@ -72,7 +73,7 @@ class CharucoBoard:
     dictionary: str = "DICT_4X4_50"  # OpenCV's name
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "squares", _counts(self.squares, 4, "squares of a ChArUco board"))
+        _require(self.squares, 4, "squares of a ChArUco board")
         if not 0 < self.marker < self.square < np.inf:
             raise CalibrationError(
                 f"a marker of {self.marker} m does not fit into a square of {self.square} m: both are sides, in metres"
@@ -103,11 +104,9 @@ def grid_of(counts: tuple[int, int]) -> Array:
     return np.stack([i.ravel(), j.ravel(), np.zeros(i.size)], axis=-1)
 
 
-def _counts(given: Any, least: int, what: str) -> tuple[int, int]:
-    counts = tuple(int(n) for n in given)
-    if len(counts) != 2 or min(counts) < least:
-        raise CalibrationError(f"{what}: at least {least} x {least} are needed, got {given}")
-    return counts[0], counts[1]
+def _require(counts: tuple[int, int], least: int, what: str) -> None:
+    if min(counts) < least:
+        raise CalibrationError(f"{what}: at least {least} x {least} are needed, got {counts}")
 
 
 Target = Board | CharucoBoard
