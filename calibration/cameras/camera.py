@@ -200,11 +200,8 @@ class StereoRig(Brief):
 
     def project(self, points_world: Array) -> Array:
         """Pixels (..., 2 cameras, n, 2) of points (..., n, 3) [m]; NaN behind a camera."""
-        views = [
-            project(points_world @ R.T + t, camera)
-            for camera, (R, t) in zip(self.cameras, self.camera_poses(), strict=True)
-        ]
-        return np.stack(views, axis=-3)
+        placed = zip(self.cameras, self.camera_poses(), strict=True)
+        return np.stack([project(points_world @ R.T + t, camera) for camera, (R, t) in placed], axis=-3)
 
     def project_with_jacobians(self, points_world: Array) -> tuple[Array, Array, Array]:
         """Pixels (..., 2, n, 2), d/d point_world (..., 2, n, 2, 3) and d/d RIG_PARAMETERS (..., 2, n, 2, 30)."""
@@ -229,10 +226,8 @@ class StereoRig(Brief):
     def perturbed(self, delta: Array) -> StereoRig:
         """The rig after a small change delta (30,) of RIG_PARAMETERS (SI units, rotation vectors in radians)."""
         delta = np.asarray(delta, float)
-        left, right = (
-            Camera.from_parameters(camera.parameters + delta[own], camera.image_size)
-            for camera, own in zip(self.cameras, OF_CAMERAS, strict=True)
-        )
+        owned = zip(self.cameras, OF_CAMERAS, strict=True)
+        left, right = (Camera.from_parameters(c.parameters + delta[own], c.image_size) for c, own in owned)
         return replace(
             self,
             left=left,
@@ -321,15 +316,11 @@ def causes(rig: StereoRig, shift: Array, further: Mapping[str, Array] | None = N
     shift : (n, k, 30) their derivative by RIG_PARAMETERS at n places, over which variances are averaged
     further : variances (k,) due to other causes
     """
-
-    def variance(C: Array) -> Array:
-        found: Array = np.einsum("nkp,nkp->k", shift @ C, shift) / len(shift)
-        return found
-
     parts: dict[str, Array] = {}
     for a in rig.allowances:
-        parts[a.cause] = parts.get(a.cause, 0.0) + variance(np.outer(a.shift, a.shift))
-    parts = {"the views": np.maximum(variance(rig.covariance) - sum(parts.values()), 0.0), **parts}
+        parts[a.cause] = parts.get(a.cause, 0.0) + np.mean((shift @ a.shift) ** 2, axis=0)
+    whole = np.einsum("nkp,nkp->k", shift @ rig.covariance, shift) / len(shift)
+    parts = {"the views": np.maximum(whole - sum(parts.values()), 0.0), **parts}
     for cause, own in (further or {}).items():
         parts[cause] = parts.get(cause, 0.0) + own
     table = np.array(list(parts.values()))
