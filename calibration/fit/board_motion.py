@@ -40,10 +40,6 @@ class BoardMotion:
         """(n, 6) inverse variances of each pair."""
         return self.weights * (np.ones((n, 1)) if self.pair_weights is None else self.pair_weights[:, None])
 
-    def is_near(self, other: BoardMotion) -> bool:
-        """True if both differ by some percent at most, which is below their uncertainty."""
-        return bool(np.allclose(self.weights, other.weights, rtol=0.05, atol=0.0))
-
 
 def motions(model: StereoModel) -> tuple[Array, Array]:
     """Rotations and shifts (n_views, 6) of the boards in the left camera's axes, and their derivative (n_views, 6, 12).

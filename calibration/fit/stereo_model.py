@@ -73,10 +73,10 @@ def predict(model: StereoModel, observations: Observations) -> tuple[Array, Arra
 def moved(model: StereoModel, stereo: Array, poses: Array, displacement: Array) -> StereoModel:
     """The model after a step: stereo (24,), displacement (n, 3), and poses, rotation vectors and shifts.
 
-    poses : (n_views, 2, 6) of each image, or (n_views, 1, 6) of both
+    stereo : empty if these parameters are fixed;  poses : (n_views, 2, 6) of each image, or (n_views, 1, 6) of both
     """
     return StereoModel(
-        rig=model.rig.perturbed(np.pad(stereo, (0, N_RIG - N_STEREO))),
+        rig=model.rig.perturbed(np.pad(stereo, (0, N_RIG - len(stereo)))),
         R_left_board=rotation_from_vector(poses[..., :3]) @ model.R_left_board,
         t_left_board=model.t_left_board + poses[..., 3:],
         points=model.points + displacement,

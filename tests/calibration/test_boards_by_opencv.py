@@ -16,8 +16,8 @@ from calibration import (
     refine_stereo,
 )
 from calibration.fit.board_motion import BoardMotion, motions
-from calibration.fit.normal_equations import Problem
 from calibration.fit.priors import BEND, MISPRINT, STRETCH, board_basis, priors_of
+from calibration.fit.refinement import Problem
 from calibration.fit.stereo_model import moved, predict_pixels
 from calibration.judge.assessment import stereo_covariance
 from calibration.judge.pairs import motion_between_exposures

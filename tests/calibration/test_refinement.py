@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from calibration import refine_stereo
 from calibration.cameras.camera import N_RIG
-from calibration.fit.normal_equations import minimise
 from calibration.fit.pairing import FLOOR
 from calibration.fit.priors import BEND, PARTS, VARIANCES, board_basis
+from calibration.fit.refinement import minimise
 from calibration.fit.start import start_stereo
 from calibration.fit.stereo_model import N_STEREO, moved
 from calibration.judge.pairs import compared
