@@ -29,7 +29,7 @@ BETTER = 2.5  # standard errors by which the held-out chi-square must decrease
 
 def fit_lens_field(refinement: Refinement) -> Refinement:
     """The refinement with the field of both lenses; unchanged if a field does not reduce the held-out error."""
-    used = refinement.observations[refinement.kept]
+    used = refinement.problem.observations
     views = np.unique(used.view)
     if len(views) < GOOD_VIEWS:
         return refinement
@@ -37,12 +37,17 @@ def fit_lens_field(refinement: Refinement) -> Refinement:
     spacing = float(size.max()) / CELLS
     columns, rows = (int(np.ceil(side / spacing)) + 3 for side in size)
     field = LensField(np.zeros((2, 2, rows, columns)), spacing)
-    priors = [_precision(field, *sizes) for sizes in SIZES_PX]
     of_views = [_rows_of(refinement, used[used.view == view], field) for view in views]
     total = np.sum([rows.T @ rows for rows in of_views], axis=0)
     known = np.append(np.arange(len(refinement.normal.prior) - 1), -1)
     total[known[:, None], known] += refinement.normal.prior
-    solution, prior = _most_likely(total, priors)
+    tried = []
+    for sizes in SIZES_PX:
+        prior = _precision(field, *sizes)
+        solution, volume = _solved(total, prior)
+        likelihood = total[:-1, -1] @ solution + 4 * np.linalg.slogdet(prior)[1] - volume
+        tried.append((float(likelihood), solution, prior))
+    _, solution, prior = max(tried, key=lambda one: one[0])
     others = np.append(np.arange(len(solution) - field.coefficients.size), len(solution))
     chi_square = np.zeros((2, len(views)))  # held-out, of each view: without a field, and with one
     for fold in range(FOLDS):
@@ -71,15 +76,6 @@ def _precision(grid: LensField, sigma: float, smooth: float) -> Array:
     steps = (np.subtract.outer(np.arange(n), np.arange(n)) for n in grid.coefficients.shape[2:])
     together = np.kron(*(0.5 * np.exp(-0.25 * step**2) for step in steps))
     return np.asarray(np.linalg.inv(sigma**2 * np.eye(len(together)) + smooth**2 * together), np.float64)
-
-
-def _most_likely(total: Array, priors: list[Array]) -> tuple[Array, Array]:
-    """The prior (a precision) with the largest marginal likelihood: parameters (s,) under it, and the prior."""
-    found = []
-    for prior in priors:
-        solution, volume = _solved(total, prior)
-        found.append((total[:-1, -1] @ solution + 4 * np.linalg.slogdet(prior)[1] - volume, solution, prior))
-    return max(found, key=lambda one: float(one[0]))[1:]
 
 
 def _rows_of(refinement: Refinement, seen: Observations, grid: LensField) -> Array:

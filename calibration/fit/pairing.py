@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calibration.board.chessboard import BoardNotFound, CornerView
+from calibration.board.chessboard import BoardNotFound, CornerView, Located
 from calibration.cameras.camera import CAMERA_NAMES, Camera, by_turning, project_with_jacobians, vector_from_rotation
 from calibration.fit.stereo_model import Observations, StereoModel
 from calibration.kit.arrays import AnyArray, Array, Indices, Mask, evenly
@@ -35,7 +35,7 @@ GOOD_VIEWS = 8  # fewer are not enough to test lenses, or views against each oth
 MOST_TRIED = 30  # pairs whose relative pose is tried, views used by OpenCV: its time grows with their third power
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,) of the board in a camera's axes
 Names = Sequence[tuple[str, str]]
-Views = tuple[list[CornerView | BoardNotFound], list[CornerView | BoardNotFound]]
+Views = tuple[list[Located], list[Located]]
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def count_once(views: Views, names: Names, table_view: int | None) -> None:
             )
 
 
-def _same_place(side: Sequence[CornerView | BoardNotFound]) -> Mask:
+def _same_place(side: Sequence[Located]) -> Mask:
     """(n, n) whether two images of a camera show the board in the same place, or neither shows it."""
     found = np.array([isinstance(view, CornerView) for view in side], bool)
     same = ~found[:, None] & ~found
@@ -226,7 +226,7 @@ def board_turns(n: int) -> list[Array]:
 
 def paired(
     sides: tuple[BoardPoses, BoardPoses], nominal: Array, n_orders: int, floor: float, names: Names
-) -> tuple[Pairing, tuple[str, ...]]:
+) -> tuple[Pairing, list[str]]:
     """The pairs as stored, and warnings about them. Raises CalibrationError if they are no pairs.
 
     sides : poses of the board in the images of each camera
@@ -247,7 +247,7 @@ def paired(
         raise CalibrationError("no view shows the target to both cameras: the pair cannot be calibrated")
     stored = most_likely(of_left, of_right, floor)
     if n < MIN_VIEWS or (stored.agrees.all() and stored.usual < TOO_FAR * floor):
-        return stored, ()
+        return stored, []
     shifts = [k for k in range(-MOST_LATE, MOST_LATE + 1) if abs(k) < n - MIN_VIEWS]
     orders = [(f"{abs(k)} {'late' if k > 0 else 'early'}", number + k) for k in shifts if k]
     orders += [("in reversed order", number[::-1] + k) for k in shifts]
@@ -298,9 +298,7 @@ def _require_agreement(stored: Pairing, others: Sequence[float]) -> None:
         )
 
 
-def _late(
-    pairs_of: Callable[[AnyArray, AnyArray], Paired], odd: Indices, found: Pairing, names: Names
-) -> tuple[str, ...]:
+def _late(pairs_of: Callable[[AnyArray, AnyArray], Paired], odd: Indices, found: Pairing, names: Names) -> list[str]:
     """Warnings about pairs among the `odd` that would agree with a later or an earlier right view."""
     rest, notes = odd, []
     for k in sorted(range(-MOST_LATE, MOST_LATE + 1), key=abs)[1:]:
@@ -314,7 +312,7 @@ def _late(
                 f"view {abs(k)} {'later' if k > 0 else 'earlier'} is taken ({names[which[0] + k][1]} in place of "
                 f"{names[which[0]][1]}): a frame was lost there. Name or move the files so that pairs have one number"
             )
-    return tuple(notes)
+    return notes
 
 
 def _both(turn: Array, shift: Array) -> Array:

@@ -161,7 +161,5 @@ def priors_of(model: StereoModel, nominal: Array, shape_basis: Array) -> Prior:
         middle[1:3] = 0.5 * (size - 1) / (CENTRE * diagonal)
         own[[3, 4, 5], [4, 5, 8]] = np.array([corner**2, corner**4, corner**6]) / RADIAL  # k1, k2, k3
         own[[6, 7], [6, 7]] = 3 * corner / TANGENTIAL
-    basis = shape_basis.reshape(nominal.size, -1)
-    return Prior(
-        rows, at, nominal, scaled_solve(basis.T @ basis, basis.T), np.eye(basis.shape[1]), np.zeros(basis.shape[1])
-    )
+    basis, n = shape_basis.reshape(nominal.size, -1), shape_basis.shape[-1]
+    return Prior(rows, at, nominal, scaled_solve(basis.T @ basis, basis.T), known=np.eye(n), towards=np.zeros(n))

@@ -24,11 +24,11 @@ CLEARLY = 0.85
 TooWide = tuple[tuple[str, str], ...]  # warnings about lenses, each with its evidence
 
 
-def for_opencv(
-    observations: Observations, index: int, nominal: Array
-) -> tuple[list[int], list[Array32], list[Array32]]:
-    """Views with enough points in one camera, and for each the target's points and their images in OpenCV's format."""
-    mine = observations[observations.camera == index]
+def for_opencv(mine: Observations, nominal: Array) -> tuple[list[int], list[Array32], list[Array32]]:
+    """Views with enough points in one camera, and for each the target's points and their images in OpenCV's format.
+
+    mine : observations of this camera
+    """
     seen = [(int(v), mine[mine.view == v]) for v in np.unique(mine.view)]
     seen = [(v, o) for v, o in seen if len(o) >= LEAST_POINTS]
     objects = [nominal[o.point].astype(np.float32) for _, o in seen]
@@ -39,7 +39,8 @@ def start_camera(
     observations: Observations, index: int, nominal: Array, image_size: tuple[int, int]
 ) -> tuple[Camera, dict[int, tuple[Array, Array]], float]:
     """One camera, {view: (R, t) of the board in it} and the squared misfit [px^2], by OpenCV with k1 alone."""
-    name, (views, objects, images) = CAMERA_NAMES[index], for_opencv(observations, index, nominal)
+    name = CAMERA_NAMES[index]
+    views, objects, images = for_opencv(observations[observations.camera == index], nominal)
     flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     w, h = image_size
     guess = np.array([[float(max(w, h)), 0, 0.5 * (w - 1)], [0, float(max(w, h)), 0.5 * (h - 1)], [0, 0, 1]])
@@ -60,18 +61,15 @@ def start_camera(
         raise CalibrationError(f"{name} camera: no start for the calibration, OpenCV says: {error.err}") from error
     finally:
         cv2.setNumThreads(threads)
-    fx, fy, cx, cy = (float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    camera = Camera(fx, fy, cx, cy, (k1, 0.0, 0.0, 0.0, 0.0), image_size)
-    poses = {
-        view: (rotation_from_vector(np.ravel(turn)), np.ravel(shift).astype(float))
-        for view, turn, shift in zip(views, turns, shifts, strict=True)
-    }
+    camera = Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], (k1, 0.0, 0.0, 0.0, 0.0), image_size)
+    taken = zip(views, turns, shifts, strict=True)
+    poses = {v: (rotation_from_vector(np.ravel(turn)), np.ravel(shift).astype(float)) for v, turn, shift in taken}
     return camera, poses, rms**2 * sum(map(len, images))
 
 
 def start_stereo(
     observations: Observations, target: Target, image_sizes: Sequence[tuple[int, int]], names: Names
-) -> tuple[Pairs, dict[int, Indices], tuple[str, ...]]:
+) -> tuple[Pairs, dict[int, Indices], list[str]]:
     """Rough cameras, their relative pose, and which images are pairs.
 
     image_sizes : of the left and of the right camera; names : (left, right) of all views
@@ -116,7 +114,7 @@ def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, 
     for index, camera in enumerate(cameras):
         if 0.5 * float(np.hypot(*camera.image_size)) < WIDE * min(camera.fx, camera.fy):
             continue
-        _, *seen = for_opencv(observations, index, nominal)
+        _, *seen = for_opencv(observations[observations.camera == index], nominal)
         objects, images = ([of_views[i] for i in evenly(len(of_views), MOST_TRIED)] for of_views in seen)
         if len(objects) < GOOD_VIEWS:
             continue
