@@ -81,8 +81,7 @@ def stereo_covariance(refinement: Refinement, common: Array | None = None) -> Ar
     # its weight was multiplied by the disagreement of the views
     extra = max(problem.prior.weight - 1.0, 0.0) * refinement.normal.prior[:-1, :-1] * scale[:, None] * scale
     by_prior = inverse.T @ extra @ inverse
-    result: Array = (at_minimum + share * beyond @ beyond.T + by_prior) * scale[:s1, None] * scale[:s1]
-    return result
+    return np.asarray((at_minimum + share * beyond @ beyond.T + by_prior) * scale[:s1, None] * scale[:s1], float)
 
 
 def cells_of(refinement: Refinement, camera: int) -> Array:
@@ -91,13 +90,6 @@ def cells_of(refinement: Refinement, camera: int) -> Array:
     pixels = o.pixels[refinement.kept & (o.camera == camera)]
     edges = [np.linspace(-0.5, size - 0.5, 9) for size in refinement.model.rig.cameras[camera].image_size]
     return np.histogram2d(pixels[:, 0], pixels[:, 1], bins=edges)[0]
-
-
-def tilt_spread(refinement: Refinement) -> float:
-    """Largest angle between the normals of two boards [deg]."""
-    views = np.unique(refinement.observations.view[refinement.kept])
-    normals = refinement.model.R_left_board[views, 0, :, 2]
-    return float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1))).max())
 
 
 def shifts_of_points(rig: StereoRig, points_world: Array) -> Array:
@@ -114,7 +106,7 @@ def measurement_volume(refinement: Refinement, on_table: bool) -> Array:
     if on_table:
         size = np.ptp(points, axis=0)[:2].min()
         return np.concatenate([points + np.array([0, 0, height]) for height in (0.0, 0.5 * size)])
-    views = np.unique(refinement.observations.view[refinement.kept])
+    views = np.unique(refinement.problem.observations.view)
     R, t = refinement.model.R_left_board[views, 0], refinement.model.t_left_board[views, 0]
     return (np.einsum("vij,nj->vni", R, points) + t[:, None]).reshape(-1, 3)
 
@@ -141,8 +133,9 @@ def assess(
     rig : with the covariance due to the views alone; rig_with_board : including the tolerances of the board
     wide : result of `start.too_wide`
     """
-    kept = refinement.observations[refinement.kept]
-    both = np.intersect1d(kept.view[kept.camera == 0], kept.view[kept.camera == 1])
+    used = refinement.problem.observations
+    both = np.intersect1d(used.view[used.camera == 0], used.view[used.camera == 1])
+    normals = refinement.model.R_left_board[np.unique(used.view), 0, :, 2]
     volume = measurement_volume(refinement, rig.world_is_table)
     shift = shifts_of_points(rig, volume)  # of points in images without noise
     variance = np.einsum("nip,pq,niq->ni", shift, rig.covariance, shift)
@@ -162,14 +155,13 @@ def assess(
         motion=motion,
         inflation=refinement.inflation,
         coverage=tuple(float(np.mean(cells_of(refinement, camera) > 0)) for camera in range(len(CAMERA_NAMES))),
-        tilt_spread_deg=tilt_spread(refinement),
+        tilt_spread_deg=float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1))).max()),
     )
-    grade, verdict, warnings = _judgement(found, refinement, wide)
-    return replace(found, grade=grade, verdict=verdict, figures=_figures(found, refinement.rms()), warnings=warnings)
+    return _judged(found, refinement, wide)
 
 
-def _judgement(found: Assessment, refinement: Refinement, wide: TooWide) -> tuple[str, str, tuple[str, ...]]:
-    """The worst grade of all figures, its reason, and warnings about figures that need action."""
+def _judged(found: Assessment, refinement: Refinement, wide: TooWide) -> Assessment:
+    """With the worst grade of all figures, its reason, and warnings about figures that need action."""
     warnings, reasons = [": ".join(what) for what in wide], [(3, what) for what, _ in wide]
     errors = found.triangulation_sigma[0], found.held_out_error
     for error, what in zip(errors, ("a point is uncertain by", "views left out of the fit are off by"), strict=True):
@@ -198,7 +190,7 @@ def _judgement(found: Assessment, refinement: Refinement, wide: TooWide) -> tupl
         )
     if found.pairs < GOOD_VIEWS:
         reasons.append((2 if found.pairs > 3 else 3, f"only {found.pairs} views were seen by both cameras"))
-    if (n_views := len(np.unique(refinement.observations.view[refinement.kept]))) < GOOD_VIEWS:
+    if (n_views := len(np.unique(refinement.problem.observations.view))) < GOOD_VIEWS:
         warnings.append(f"{n_views} views are few (good: 15 to 40)")
     if found.inflation > TWICE:
         warnings.append(
@@ -216,8 +208,9 @@ def _judgement(found: Assessment, refinement: Refinement, wide: TooWide) -> tupl
         warnings.append("the refinement did not converge: the result is not the least-squares minimum")
     # the first if several are equal
     worst, why = max(reasons, key=lambda item: item[0], default=(3, "nothing shows how good it is"))
-    grade = [*GRADES][worst]
-    return grade, f"{grade.capitalize()}: {why}", tuple(warnings)
+    grade, figures = [*GRADES][worst], _figures(found, refinement.rms())
+    verdict = f"{grade.capitalize()}: {why}"
+    return replace(found, grade=grade, verdict=verdict, figures=figures, warnings=tuple(warnings))
 
 
 def _figures(found: Assessment, rms: float) -> str:

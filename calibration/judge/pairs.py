@@ -14,7 +14,6 @@ common to an image, such as correlated errors of neighbouring corners, or distor
 """
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -143,11 +142,9 @@ def judge_pairs(observations: Observations, fit: Refinement, table_view: int | N
     rms = np.sqrt(np.bincount(image, square) / count)
     typical = float(np.median(rms))
     is_bad = (rms > TOO_FAR * typical) & (len(rms) >= 2 * MIN_VIEWS)
-    bad = {
-        divmod(int(i), 2): f"RMS {own:.3f} px by itself, the median image has {typical:.3f} px: blurred, or the board "
-        "was found wrongly"
-        for i, own in zip(images[is_bad], rms[is_bad], strict=True)
-    }
+    why = f"the median image has {typical:.3f} px: blurred, or the board was found wrongly"
+    found = zip(images[is_bad].tolist(), rms[is_bad], strict=True)
+    bad = {divmod(one, 2): f"RMS {own:.3f} px by itself, {why}" for one, own in found}
     views = np.flatnonzero(np.bincount(images[~is_bad & (count >= LEAST_POINTS)] // 2) == len(CAMERA_NAMES))
     return compared(observations, Pairs(alone, views, bad_images=bad), table_view)
 
@@ -202,7 +199,6 @@ def compared(observations: Observations, pairs: Pairs, table_view: int | None, f
     floor : distance, over the image's longer side, below which pairs agree in any case
     """
     model, views, sides = pairs.model, pairs.views, []
-    R_pair = model.rig.R_right_left
     if len(views) < 2 * MIN_VIEWS:  # a median distance needs several other pairs
         return pairs
     for index, (R, t) in enumerate(model.rig.camera_poses()):
@@ -218,18 +214,17 @@ def compared(observations: Observations, pairs: Pairs, table_view: int | None, f
     np.fill_diagonal(between, np.nan)
     cuts = _cuts(between)
     stretches = np.split(np.arange(len(views)), [at for at, _, _ in cuts])
-    odd, steps = {}, []
+    odd = {}
     for stretch in stretches:
         off = np.nanmedian(between[np.ix_(stretch, stretch)], axis=1)
         usual = max(float(np.median(off)), floor * max(model.rig.left.image_size))
         for k in np.flatnonzero(off > TOO_FAR * usual):
             odd[int(views[stretch[k]])] = f"{off[k]:.2g} px apart, where the others agree to {usual:.2g} px"
-    for (_, pixels, scatter), (before, after) in zip(cuts, pairwise(stretches), strict=True):
-        # plain units: random motions contain rotations and shifts that nearly cancel in the image
-        turn = np.median(vector_from_rotation(R[after] @ R_pair.T), axis=0)
-        turn -= np.median(vector_from_rotation(R[before] @ R_pair.T), axis=0)
-        shift = np.median(t[after], axis=0) - np.median(t[before], axis=0)
-        steps.append((float(np.linalg.norm(turn)), float(np.linalg.norm(shift)), pixels, scatter))
+    # plain units: random motions contain rotations and shifts that nearly cancel in the image
+    places = np.stack([vector_from_rotation(R @ model.rig.R_right_left.T), t], axis=1)  # (n, 2, 3)
+    moves = np.diff([np.median(places[stretch], axis=0) for stretch in stretches], axis=0)
+    sizes = np.linalg.norm(moves, axis=2).tolist()
+    steps = [(turn, shift, pixels, scatter) for (turn, shift), (_, pixels, scatter) in zip(sizes, cuts, strict=True)]
     kept = int(np.argmax([len(stretch) for stretch in stretches]))
     if table_view is not None:
         kept = int(np.searchsorted([views[at] for at, _, _ in cuts], table_view, "right"))

@@ -87,8 +87,7 @@ def _over_the_board(nominal: Array, heights: Array) -> Array:
     step = np.array([np.diff(np.unique(np.round(side, 9))).min() for side in (x, y)])
     u, v = (np.linspace(-1.0, 1.0, 21) * (np.abs(side).max() + s) for side, s in zip((x, y), step, strict=True))
     wide = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    found: Array = terms(*wide.T) @ np.linalg.lstsq(terms(x, y), heights, rcond=None)[0]
-    return found
+    return terms(*wide.T) @ np.linalg.lstsq(terms(x, y), heights, rcond=None)[0]
 
 
 def with_tolerances(
@@ -123,10 +122,9 @@ def with_tolerances(
             found.append(Allowance(cause, parameters, cause in assumed and assumed[cause] is None))
 
     R, half, middle = rig.R_left_world, np.abs(d).max(0), nominal.mean(0)
-    if not rig.world_is_table:
-        allow(SIZE, np.zeros(3), pair=size * rig.t_right_left)
-    else:
-        allow(SIZE, size * (rig.t_left_world + board_thickness * R[:, 2]), pair=size * rig.t_right_left)
+    t_left_board = rig.t_left_world + board_thickness * R[:, 2]
+    allow(SIZE, size * t_left_board if rig.world_is_table else np.zeros(3), pair=size * rig.t_right_left)
+    if rig.world_is_table:
         allow(SIZE, 0.5 * stretch * (middle[0] * R[:, 0] - middle[1] * R[:, 1]))
         allow(THICKNESS, thickness * R[:, 2])
         allow(FLATNESS, flatness * R[:, 2])
