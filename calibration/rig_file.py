@@ -14,16 +14,7 @@ import h5py
 import numpy as np
 
 from calibration.board.target import described, target_of
-from calibration.cameras.camera import (
-    CAMERA_NAMES,
-    INTRINSIC_PARAMETERS,
-    N_INTRINSIC,
-    N_RIG,
-    RIG_PARAMETERS,
-    Allowance,
-    Camera,
-    StereoRig,
-)
+from calibration.cameras.camera import CAMERA_NAMES, INTRINSIC_PARAMETERS, RIG_PARAMETERS, Allowance, Camera, StereoRig
 from calibration.cameras.splines import LensField
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import AnyArray
@@ -46,7 +37,7 @@ class Dataset(NamedTuple):
 
 
 _OF_CAMERA = {
-    "intrinsics": Dataset((N_INTRINSIC,), "px (first four), 1", ", ".join(INTRINSIC_PARAMETERS)),
+    "intrinsics": Dataset((len(INTRINSIC_PARAMETERS),), "px (first four), 1", ", ".join(INTRINSIC_PARAMETERS)),
     "image_size": Dataset((2,), "px", "width, height", "iu"),
 }
 _BESIDE_CAMERAS = {
@@ -55,12 +46,12 @@ _BESIDE_CAMERAS = {
     "R_left_world": Dataset((3, 3), "1", "rotation from world to left camera axes"),
     "t_left_world": Dataset((3,), "m", "origin of the world in left camera axes"),
     "covariance": Dataset(
-        (N_RIG, N_RIG),
+        (len(RIG_PARAMETERS), len(RIG_PARAMETERS)),
         "products of the units of the parameters (px, 1, rad, m)",
         "of the parameters named in `parameters`; rotation vectors multiply from the left; common to all frames",
     ),
     "allowances": Dataset(
-        ("causes", N_RIG),
+        ("causes", len(RIG_PARAMETERS)),
         "px, 1, rad, m",
         "parts of the covariance that no image tells, one row for one standard deviation of each cause",
     ),
@@ -303,8 +294,7 @@ def complete_file(
     try:
         check_seal(path)
         with h5py.File(path, "r") as file, np.errstate(all="ignore"):
-            if file.attrs.get("schema") != schema:
-                found = file.attrs.get("schema")
+            if (found := file.attrs.get("schema")) != schema:
                 raise raised(f"an HDF5 file, but not a {kind} (its schema is {found!r}, expected {schema!r})")
             if int(file.attrs.get("schema_version", -1)) > version:
                 raise raised("written by a newer version of disctrack; update to read it")
@@ -340,9 +330,8 @@ def _get(group: h5py.Group, name: str, row: Dataset, sizes: Mapping[str, int] | 
 
 def read_rig_group(group: h5py.Group) -> StereoRig:
     """Inverse of `write_rig_group`. Raises RigFileError if the content is not a rig."""
-    return read_beside_cameras(
-        group, [[_get(group, f"{name}_{what}", row) for what, row in _OF_CAMERA.items()] for name in CAMERA_NAMES]
-    )
+    cameras = [[_get(group, f"{name}_{what}", row) for what, row in _OF_CAMERA.items()] for name in CAMERA_NAMES]
+    return read_beside_cameras(group, cameras)
 
 
 def read_beside_cameras(group: h5py.Group, of_cameras: Iterable[Sequence[AnyArray]]) -> StereoRig:

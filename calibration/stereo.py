@@ -1,13 +1,13 @@
 """From synchronised views of a chessboard, or its corners, to a calibrated stereo rig with its uncertainty."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.board.chessboard import BoardNotFound, CornerView, negatives
+from calibration.board.chessboard import BoardNotFound, CornerView, Located, negatives
 from calibration.board.search import Progress, located
 from calibration.board.target import Board, Target
 from calibration.cameras.camera import CAMERA_NAMES, StereoRig
@@ -45,9 +45,9 @@ class StereoCalibration(Brief):
     table_view: int | None
     board_thickness: float  # [m]
     view_names: tuple[tuple[str, str], ...]  # (n_views,) left and right name
-    corner_views: tuple[tuple[CornerView | BoardNotFound, ...], tuple[CornerView | BoardNotFound, ...]]
+    corner_views: tuple[tuple[Located, ...], tuple[Located, ...]]
     assessment: Assessment
-    warnings: tuple[str, ...] = field(default=())
+    warnings: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()  # reasons for which errors of the rig may exceed its sigmas
     apart: tuple[int, ...] = ()  # views whose two images are used separately
 
@@ -95,9 +95,8 @@ class StereoCalibration(Brief):
     @property
     def lens_rms_px(self) -> tuple[float, ...]:
         """Root mean square per axis of the lens field of each camera, at the used corners; () without one."""
-        field, r = self.rig.lens_field, self.refinement
-        pixels = [r.observations.pixels[r.kept & (r.observations.camera == c)] for c in range(len(CAMERA_NAMES))]
-        moved = [field.displacement(seen, c) for c, seen in enumerate(pixels)] if field else []
+        field, used = self.rig.lens_field, self.refinement.problem.observations
+        moved = [field.displacement(used.pixels[used.camera == c], c) for c in (0, 1)] if field else []
         return tuple(float(np.sqrt(np.mean(by**2))) for by in moved)
 
     def rejected_corners(self) -> list[tuple[int, int, int, str]]:
@@ -143,15 +142,13 @@ def calibrate_stereo(
         )
     names = names or [(f"left {i}", f"right {i}") for i in range(len(left_images))]
     check_sizes(left_images, right_images, names)
-    (left, note_left), (right, note_right) = (
-        repaired_views(side, name) for side, name in zip((left_images, right_images), CAMERA_NAMES, strict=True)
-    )
-    views, n = located([*left, *right], board, progress), len(left_images)
+    sides, notes = zip(*map(repaired_views, (left_images, right_images), CAMERA_NAMES), strict=True)
+    images, n = [*chain(*sides)], len(left_images)
+    views = located(images, board, progress)
     found = calibrate_from_corners(views[:n], views[n:], board, tolerances, table_view, board_thickness, names)
-    seen = [view for side in found.corner_views for view in side]
-    negative = negatives([*left, *right], seen, board) if isinstance(board, Board) else ""
-    notes = filter(None, (note_left, note_right))
-    return replace(found, doubts=(negative,) if negative else (), warnings=(*notes, *found.warnings))
+    negative = negatives(images, [*chain(*found.corner_views)], board) if isinstance(board, Board) else ""
+    doubts = (negative,) if negative else ()
+    return replace(found, doubts=doubts, warnings=(*filter(None, notes), *found.warnings))
 
 
 def check_sizes(left: Sequence[AnyArray], right: Sequence[AnyArray], names: Sequence[tuple[str, str]]) -> None:
@@ -172,8 +169,8 @@ def check_sizes(left: Sequence[AnyArray], right: Sequence[AnyArray], names: Sequ
 @one_blas_thread
 @checked
 def calibrate_from_corners(
-    left_views: Sequence[CornerView | BoardNotFound],
-    right_views: Sequence[CornerView | BoardNotFound],
+    left_views: Sequence[Located],
+    right_views: Sequence[Located],
     board: Target,
     tolerances: BoardTolerances | None = None,
     table_view: int | None = None,
@@ -267,9 +264,7 @@ def calibrate_from_points(
     return found
 
 
-def _view(
-    points: ArrayLike | None, board: Board, image_size: tuple[int, int], sigma: float, where: str
-) -> CornerView | BoardNotFound:
+def _view(points: ArrayLike | None, board: Board, image_size: tuple[int, int], sigma: float, where: str) -> Located:
     if points is None:
         return BoardNotFound("no corners were given")
     pixels, n, size = np.asarray(points, float), len(board.points), np.array(image_size)
@@ -297,7 +292,7 @@ def _begin(views: Views, board: Target, names: Names) -> tuple[Pairs, list[str]]
     sizes = [next(v.image_size for v in side if isinstance(v, CornerView)) for side in views]
     start, orders, notes = start_stereo(_observations(views), board, sizes, names)
     if len(board.orders) == 1:
-        return start, [*notes]
+        return start, notes
     for v, order in orders.items():
         view = views[1][v]
         views[1][v] = view.reordered(order) if isinstance(view, CornerView) else view
@@ -355,7 +350,7 @@ def _require_table(table_view: int | None, unusable: Mapping[int, str]) -> None:
 
 def _require_fitted(refinement: Refinement, not_used: Iterable[Image], wide: TooWide) -> None:
     """Raises CalibrationError if too few views can be used, or if they contradict each other."""
-    n_used = len(np.unique(refinement.observations.view[refinement.kept]))
+    n_used = len(np.unique(refinement.problem.observations.view))
     if n_used < MIN_VIEWS:
         also = "".join(f"{what}: {by_what}. " for what, by_what in wide)
         listed = _listed(not_used)
@@ -368,13 +363,13 @@ def _require_fitted(refinement: Refinement, not_used: Iterable[Image], wide: Too
             )
 
 
-def _lost(views: tuple[Sequence[CornerView | BoardNotFound], ...], names: Names) -> Iterator[list[Image]]:
+def _lost(views: tuple[Sequence[Located], ...], names: Names) -> Iterator[list[Image]]:
     """The images of each view that are not used."""
     for v, pair in enumerate(zip(*views, strict=True)):
         yield [(names[v][c], view.reason) for c, view in enumerate(pair) if isinstance(view, BoardNotFound)]
 
 
-def _not_used(views: tuple[Sequence[CornerView | BoardNotFound], ...], names: Names) -> dict[int, list[Image]]:
+def _not_used(views: tuple[Sequence[Located], ...], names: Names) -> dict[int, list[Image]]:
     """Views that neither camera can use."""
     return {v: images for v, images in enumerate(_lost(views, names)) if len(images) == len(CAMERA_NAMES)}
 
@@ -435,15 +430,13 @@ def _observations(views: Views) -> Observations:
 
 def _warnings_of_pairs(pairs: Pairs, names: Names, table_view: int | None) -> list[str]:
     """Warnings about pairs whose images are used separately, each for its own camera."""
-    moved = [camera_moved(pairs, names, table_view)] if pairs.steps else []
-    apart = {v: why for v, why in pairs.odd.items() if v not in pairs.others}
-    if not apart:
-        return moved
-    shown = [f"{names[v][0]} and {names[v][1]} ({why})" for v, why in list(apart.items())[:3]]
-    more = f" and {len(apart) - 3} more" if len(apart) > 3 else ""
-    return [
-        *moved,
-        f"{'; '.join(shown)}{more}: the two images do not show the board in one place: it moved between the "
-        "exposures, or they are not a pair. Each image is used for its own camera, none of them for how the cameras "
-        "stand to each other",
-    ]
+    warnings = [camera_moved(pairs, names, table_view)] if pairs.steps else []
+    if apart := {v: why for v, why in pairs.odd.items() if v not in pairs.others}:
+        shown = [f"{names[v][0]} and {names[v][1]} ({why})" for v, why in list(apart.items())[:3]]
+        more = f" and {len(apart) - 3} more" if len(apart) > 3 else ""
+        warnings.append(
+            f"{'; '.join(shown)}{more}: the two images do not show the board in one place: it moved between the "
+            "exposures, or they are not a pair. Each image is used for its own camera, none of them for how the "
+            "cameras stand to each other"
+        )
+    return warnings
