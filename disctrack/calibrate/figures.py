@@ -34,9 +34,8 @@ def residuals_figure(found: StereoCalibration) -> Figure:
             views.text(view, 0, "not used", rotation=90, ha="center", va="bottom", fontsize=7, color=INK)
         views.xaxis.set_major_locator(MaxNLocator(integer=True))
         views.set(xlabel="view", ylabel="rms (px)", ylim=(0.0, 1.1 * np.nanmax(found.rms_per_view_px)))
-    figure.suptitle(
-        f"Calibration residuals (arrows {scale:.0f} times longer; black: unused; shaded: cells with corners)"
-    )
+    legend = f"arrows {scale:.0f} times longer; black: unused; shaded: cells with corners"
+    figure.suptitle(f"Calibration residuals ({legend})")
     return figure
 
 
@@ -52,10 +51,8 @@ def _image_frame(axes: Axes, found: StereoCalibration, camera: int) -> None:
 def _arrows(axes: Axes, found: StereoCalibration, camera: int, scale: float, most: float) -> None:
     """Arrows `scale` times as long as residuals, which are cut to `most` [px] for corners that were not used."""
     refinement, mine = found.refinement, found.refinement.observations.camera == camera
-    for select, colour, longest in (
-        (refinement.kept, COLOURS[CAMERAS[camera]], np.inf),
-        (~refinement.kept, INK, most),
-    ):
+    kinds = (refinement.kept, COLOURS[CAMERAS[camera]], np.inf), (~refinement.kept, INK, most)
+    for select, colour, longest in kinds:
         arrows = refinement.residuals[mine & select]
         length = np.linalg.norm(arrows, axis=1, keepdims=True)
         arrows = scale * arrows * np.minimum(1.0, longest / np.maximum(length, 1e-12))

@@ -101,10 +101,8 @@ def boards_of(record: Record, views: TargetImages | None) -> Boards:
 
 def noticed_in(record: Mapping[str, Any]) -> tuple[Finding, ...]:
     """`doubts` and `warnings` of a calibration as findings."""
-    kinds = (Severity.DOUBT, "doubts"), (Severity.WARNING, "warnings")
-    return tuple(
-        finding for severity, name in kinds for finding in of_kind(Kind.CALIBRATION, severity, record.get(name, ()))
-    )
+    doubts = of_kind(Kind.CALIBRATION, Severity.DOUBT, record.get("doubts", ()))
+    return doubts + of_kind(Kind.CALIBRATION, Severity.WARNING, record.get("warnings", ()))
 
 
 def given_rig(file: Path) -> tuple[StereoRig, Report]:
@@ -134,7 +132,10 @@ def calibrate_into(
             )
         summarised["rows"].append(("reused", f"{path}: complete result of the same views, settings and version"))
         return read_rig(path), _report(summarised, [path])
-    found, problems = _calibrate(source)
+    with compiling("corners", 8):
+        corner_fit.prepare()
+    with progress_bar("calibrate", 2 * len(source.views), "image") as advance:
+        found, problems = source.calibrated(lambda stage, done, total: advance(1))
     found = dataclasses.replace(found, warnings=(*problems, *found.warnings))
     if found.assessment.beyond_use and not force:
         said = "; ".join([found.assessment.verdict, *found.warnings])
@@ -185,10 +186,3 @@ def _reusable(path: Path, provenance: Provenance) -> dict[str, Any] | None:
     with complete_rig(path, "calibrate --overwrite") as file:
         same = file.attrs.get("fingerprint") == provenance.fingerprint
         return dict(json.loads(file.attrs["summary"])) if same else None
-
-
-def _calibrate(source: CalibrationSource) -> tuple[StereoCalibration, tuple[str, ...]]:
-    with compiling("corners", 8):
-        corner_fit.prepare()
-    with progress_bar("calibrate", 2 * len(source.views), "image") as advance:
-        return source.calibrated(lambda stage, done, total: advance(1))
