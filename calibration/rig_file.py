@@ -1,9 +1,14 @@
-"""Rig files: self-describing HDF5 with the corners used, so that a calibration can be checked and repeated later."""
+"""Rig files: self-describing HDF5 with the corners used, so that a calibration can be checked and repeated later.
+
+A checksum at the end is checked before reading, as the HDF5 library may hang or crash on damaged files. HDF5 stores its
+own length and ignores what follows; if it writes to a file, it cuts that off.
+"""
 
 import contextlib
 import io
 import json
 import os
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from importlib import metadata
@@ -19,11 +24,11 @@ from calibration.cameras.splines import LensField
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import AnyArray
 from calibration.kit.errors import RigFileError
-from calibration.kit.seal import check_seal, sealed
 from calibration.stereo import StereoCalibration
 
 SCHEMA = "disctrack stereo rig"
 SCHEMA_VERSION = 1
+_MARK = b"\ncrc32 "
 MAX_VALUES = 50_000_000  # of one dataset: with more, the file is no rig
 
 
@@ -185,6 +190,18 @@ def rig_bytes(content: StereoRig | StereoCalibration, attributes: Mapping[str, A
     return sealed(buffer)
 
 
+def _seal(content: bytes | memoryview) -> bytes:
+    return _MARK + f"{zlib.crc32(content):08x}".encode()
+
+
+def sealed(buffer: io.BytesIO) -> memoryview:
+    """A file in memory, with the checksum of all its bytes appended."""
+    seal = _seal(buffer.getbuffer())
+    buffer.seek(0, os.SEEK_END)
+    buffer.write(seal)
+    return buffer.getbuffer()
+
+
 def put_array(group: h5py.Group, name: str, value: Any, row: Dataset) -> None:
     """A dataset with its unit and description."""
     data = np.asarray(value)
@@ -274,6 +291,14 @@ def read_rig_file(path: str | os.PathLike[str]) -> tuple[StereoRig, Record | Non
     with complete_rig(Path(path)) as file:
         record = _read_record(file["calibration"]) if "calibration" in file else None
         return read_rig_group(file["rig"]), record
+
+
+def check_seal(path: Path) -> None:
+    """Raises ValueError if a sealed file has changed; OSError if it cannot be read."""
+    content, n = np.memmap(path, np.uint8, "r"), len(_seal(b""))
+    end = content[-n:].tobytes()
+    if end.startswith(_MARK) and end != _seal(content[:-n].data):
+        raise ValueError("its bytes are not those that were written: damaged on the disk or by a copy")
 
 
 def complete_rig(path: Path, command: str = "calibrate") -> contextlib.AbstractContextManager[h5py.File]:

@@ -22,8 +22,7 @@ from calibration.cameras.camera import RIG_PARAMETERS, StereoRig
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import AnyArray, Mask
 from calibration.kit.brief import Brief
-from calibration.kit.seal import sealed
-from calibration.rig_file import beside_cameras, complete_file, read_beside_cameras, versions, write_attributes
+from calibration.rig_file import beside_cameras, complete_file, read_beside_cameras, sealed, versions, write_attributes
 from disctrack.disc import Disc
 from disctrack.errors import OutputError, TrajectoryFileError, told_as
 from disctrack.files.json_text import json_sha256, json_text

@@ -14,9 +14,8 @@ import numpy as np
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import checked
-from calibration.kit.seal import check_seal
 from calibration.rig_file import SCHEMA as RIG
-from calibration.rig_file import read_rig, write_rig
+from calibration.rig_file import check_seal, read_rig, write_rig
 from disctrack.errors import OutputError, TrajectoryFileError, told_as
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import refuse_existing, write_whole
