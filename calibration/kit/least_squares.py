@@ -244,7 +244,7 @@ def solve_bounded(right: Array, matrix: Array, lower: Array, upper: Array) -> Ar
     length = np.linalg.norm(matrix, axis=0)
     if length.size == 0:
         return np.zeros(0)
-    scale = np.where(length > 0, 1.0 / np.where(length > 0, length, 1.0), 1.0)
+    scale = 1.0 / np.where(length > 0, length, 1.0)
     scaled = matrix * scale
     x = np.asarray(np.linalg.lstsq(scaled, right, rcond=UNDETERMINED)[0] * scale, float)
     if bool(np.all((x >= lower) & (x <= upper))):
@@ -279,10 +279,9 @@ def covariance_within(matrix: Array, right: Array, x: Array, lower: Array, upper
     held = held[sigma[held] > 0]
     beyond = outwards[held] * (free @ (matrix.T @ right))[held] / sigma[held]
     share = np.array([_within_bound(float(t)) for t in beyond])
-    across = np.zeros((k, held.size))
+    across = np.eye(k)[:, held]
     correlation = free[np.ix_(held, held)] / np.outer(sigma[held], sigma[held])
     across[others] = free[np.ix_(others, held)] / sigma[held] @ np.linalg.pinv(correlation, rcond=1e-10) / sigma[held]
-    across[held, np.arange(held.size)] = 1.0
     inside = correlation * np.outer(share * sigma[held], share * sigma[held])
     return np.asarray(covariance + across @ inside @ across.T, float)
 
