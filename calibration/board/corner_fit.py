@@ -131,14 +131,10 @@ def _starts(grey: Array, points: Array, axes: Array, blur: float, aside: float) 
     """Initial guesses (n, 9); grey levels from the four squares at the corner, `aside` squares from both edges."""
     levels = squares_round(grey, points, axes, aside)
     same, other = np.where(np.isnan(levels), levels[..., ::-1], levels).mean(-1).T
-    starts = np.zeros((len(points), N_CORNER))
-    starts[:, :2] = points
-    starts[:, 2:4] = np.arctan2(axes[..., 1], axes[..., 0])
-    starts[:, 4] = blur
-    starts[:, 5] = 0.5 * (same + other)
+    angles, zero = np.arctan2(axes[..., 1], axes[..., 0]), np.zeros_like(same)
     # sign(u) sign(v): where alpha and beta are both positive, u = across i has the sign of the area, v the opposite
-    starts[:, 6] = -0.5 * (same - other)
-    return starts
+    mean, half_contrast = 0.5 * (same + other), -0.5 * (same - other)
+    return np.column_stack([points, angles, zero + blur, mean, half_contrast, zero, zero])
 
 
 def _displacement(found: Array, seen: Mask, axes: Array, inner_corners: tuple[int, int]) -> Array:

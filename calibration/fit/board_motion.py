@@ -55,8 +55,8 @@ def motions(model: StereoModel) -> tuple[Array, Array]:
     by_poses = np.zeros((len(turn), 6, 12))
     for first, (arm, sign) in zip((0, 6), zip(arms, (-1.0, 1.0), strict=True), strict=True):
         by_poses[:, :, first : first + 6] = sign * np.eye(6)
-        for axis in range(3):  # a rotation v about the board's origin moves its middle by v x arm
-            by_poses[:, 3:, first + axis] = sign * np.cross(np.eye(3)[axis], arm)
+        # a rotation v about the board's origin moves its middle by v x arm
+        by_poses[:, 3:, first : first + 3] = sign * np.cross(np.eye(3), arm[:, None]).swapaxes(1, 2)
     return motion, by_poses
 
 

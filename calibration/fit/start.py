@@ -101,8 +101,7 @@ def start_stereo(
         for view, (R, t) in alone.items():
             R_board[view, image], t_board[view, image] = R, t
     model = StereoModel(StereoRig(cameras[0], cameras[1], R_pair, t_pair), R_board, t_board, nominal.copy())
-    orders_seen = {v: orders[k] for v, k in zip(both, pairs.order, strict=True)}
-    return Pairs(model, np.array(both)), orders_seen, notes
+    return Pairs(model, np.array(both)), {v: orders[k] for v, k in zip(both, pairs.order, strict=True)}, notes
 
 
 def too_wide(observations: Observations, nominal: Array, cameras: tuple[Camera, Camera]) -> TooWide:
