@@ -202,12 +202,12 @@ def sealed(buffer: io.BytesIO) -> memoryview:
     return buffer.getbuffer()
 
 
-def put_array(group: h5py.Group, name: str, value: Any, row: Dataset) -> None:
-    """A dataset with its unit and description."""
+def put_array(group: h5py.Group, name: str, value: Any, row: Dataset, attributes: Mapping[str, str] = {}) -> None:
+    """A dataset with its unit and description, and further attributes."""
     data = np.asarray(value)
     options = {"compression": "gzip", "shuffle": True, "fletcher32": True} if data.size > 1000 else {}
     dataset = group.create_dataset(name, data=data, **options)
-    dataset.attrs.update(units=row.units, description=row.description)
+    dataset.attrs.update(units=row.units, description=row.description, **attributes)
 
 
 def write_rig_group(group: h5py.Group, rig: StereoRig) -> None:
@@ -217,9 +217,8 @@ def write_rig_group(group: h5py.Group, rig: StereoRig) -> None:
     for name, camera in zip(CAMERA_NAMES, rig.cameras, strict=True):
         for (what, row), value in zip(_OF_CAMERA.items(), (camera.parameters, camera.image_size), strict=True):
             put_array(group, f"{name}_{what}", value, row._replace(description=f"{name} camera: {row.description}"))
-    for name, (values, row, attributes) in beside_cameras(rig).items():
-        put_array(group, name, values, row)
-        group[name].attrs.update(attributes)
+    for name, (value, row, attributes) in beside_cameras(rig).items():
+        put_array(group, name, value, row, attributes)
 
 
 def beside_cameras(rig: StereoRig) -> dict[str, tuple[Any, Dataset, dict[str, str]]]:
