@@ -30,6 +30,7 @@ MIN_TO_BEGIN = 5  # dot images that a newly found pose needs: three fit any pose
 # Frames over which the last motion is extrapolated, each at the cost of one fit of the dots; also the longest wait
 # between searches, each of which costs as much as some 600 fits
 PATIENCE = 60
+LIMITS = kernels.Limits()
 MOST_USUAL = 0.1  # largest rms residual of declared dots, over the contrast
 REPEAT_REACH = 4  # preceding frames with which an image is compared: recorders repeat from buffers of a few
 
@@ -96,12 +97,7 @@ class Follower:
 
 
 def run(
-    follower: Follower,
-    heading: Heading,
-    images: Image,
-    readable: Mask,
-    rows: Tables,
-    limits: kernels.Limits = kernels.Limits(),  # noqa: B008  # a tuple
+    follower: Follower, heading: Heading, images: Image, readable: Mask, rows: Tables, limits: kernels.Limits = LIMITS
 ) -> tuple[int, Heading]:
     """Follow the disc through images (n, 2, height, width).
 
@@ -182,11 +178,9 @@ def recover(follower: Follower, images: Image, readable: Mask) -> bool:
     First the last motion is extrapolated, at the cost of one frame. Velocity is constant, as one bad pose would spoil
     an acceleration. Then the whole images are searched, after waits that grow by a frame with each failure.
     """
-    if follower.heading is not None and follower.lost is not None and follower.lost <= PATIENCE:
-        carried = follower.heading.carried_on(follower.lost)
-        if _holds(follower, carried, images, readable):
-            follower.heading = carried
-            return True
+    heading, lost = follower.heading, follower.lost or 0
+    if heading is not None and lost <= PATIENCE and _resumed(follower, heading.carried_on(lost), images, readable):
+        return True
     if follower.waited < min(follower.failures, PATIENCE):
         return False
     if _search(follower, images, readable):
@@ -196,11 +190,12 @@ def recover(follower: Follower, images: Image, readable: Mask) -> bool:
     return False
 
 
-def _holds(follower: Follower, heading: Heading, images: Image, readable: Mask) -> bool:
-    """True if enough dots are measured in the first of the pairs at the predicted pose."""
+def _resumed(follower: Follower, heading: Heading, images: Image, readable: Mask) -> bool:
+    """Set the heading, and return True, if enough dots are measured in the first of the pairs at its prediction."""
     trial = empty_tables(1, follower.disc.n_markers)
     done, _ = run(follower, heading, images[:1], readable[:1], trial)
-    if done and _enough(trial.status):
+    if done and _enough(trial.status[0]):
+        follower.heading = heading
         return True
     if not follower.first_reason:
         kinds, counts = np.unique(trial.status, return_counts=True)
@@ -212,7 +207,7 @@ def _holds(follower: Follower, heading: Heading, images: Image, readable: Mask) 
 
 
 def _enough(status: Codes) -> bool:
-    """True if a pose with dots of this status (1, 2, m) cannot be due to chance."""
+    """True if a pose with dots of this status (2, m) cannot be due to chance."""
     found = int(np.sum(status == MarkerStatus.MEASURED))
     return found >= min(MIN_TO_BEGIN, status.shape[-1])
 
@@ -222,20 +217,15 @@ def _go_back(follower: Follower, images: Image, readable: Mask, rows: Tables, fo
     first = found
     while first > 0 and rows.frame_status[first - 1] == FrameStatus.MARKERS_NOT_FOUND:
         first -= 1
-    if first == found:
-        return
     trial = empty_tables(found - first, follower.disc.n_markers)
     heading = Heading.steady((rows.R[found], rows.t[found]), (rows.R[found + 1], rows.t[found + 1]))
     pairs: Image = np.ascontiguousarray(images[first:found][::-1])  # type: ignore[assignment]  # the stubs forget it
     usable = np.ascontiguousarray(readable[first:found][::-1])
     done, _ = run(follower, heading, pairs, usable, trial)
-    for k in range(done):
-        if not _enough(trial.status[k : k + 1]):
-            break
-        i = found - 1 - k
-        for name in ("results", "status", "R", "t"):
-            getattr(rows, name)[i] = getattr(trial, name)[k]
-        rows.frame_status[i] = FrameStatus.MEASURED
+    good = next((k for k in range(done) if not _enough(trial.status[k])), done)
+    rows.frame_status[found - good : found] = FrameStatus.MEASURED
+    for name in ("results", "status", "R", "t"):
+        getattr(rows, name)[found - good : found] = getattr(trial, name)[:good][::-1]
 
 
 def _search(follower: Follower, images: Image, readable: Mask) -> bool:
@@ -251,10 +241,7 @@ def _search(follower: Follower, images: Image, readable: Mask) -> bool:
     heading = Heading.steady(_nearest_alike(before, pose, follower.disc), before).carried_on(-1)
     if not follower.measured:
         _measure_blur_and_noise(follower, images, readable, heading)
-    if not _holds(follower, heading, images, readable):
-        return False
-    follower.heading = heading
-    return True
+    return _resumed(follower, heading, images, readable)
 
 
 def _nearest_alike(pose: Pose, following: Pose, disc: Disc) -> Pose:
@@ -270,11 +257,11 @@ def _measure_blur_and_noise(follower: Follower, images: Image, readable: Mask, h
     n = min(SAMPLE, len(images))
     edges = [Edge(noise=rough_noise(images[seen.argmax(), camera])) for camera, seen in enumerate(readable[:n].T)]
     # the second time with the blur and the residual noise of the first
-    for limits in (kernels.Limits(blur=np.inf, share=MOST_USUAL), kernels.Limits()):
+    for limits in (kernels.Limits(blur=np.inf, share=MOST_USUAL), LIMITS):
         # kept also if the fit fails: the status of the dots depends on the noise assumed
         follower.edges, trial = tuple(edges), empty_tables(n, follower.disc.n_markers)
         done, _ = run(follower, heading, images[:n], readable[:n], trial, limits)
-        if done == 0 or not _enough(trial.status[:1]):
+        if done == 0 or not _enough(trial.status[0]):
             return
         for camera in range(2):
             fits = trial.results[:done, camera][trial.status[:done, camera] == MarkerStatus.MEASURED]
