@@ -73,6 +73,11 @@ def _nanmedian(values: Array) -> Array:
         return np.asarray(np.nanmedian(values, axis=1))
 
 
+def _middle(values: Array) -> float:
+    """Median of the values (n,) without NaN, at least 1, also if there is none."""
+    return float(np.fmax(_nanmedian(values[None])[0], 1.0))
+
+
 def outlying_frames(residuals: Array) -> Mask:
     """(n,) True for frames whose residuals are far above the median: they are excluded from shared estimates.
 
@@ -85,13 +90,9 @@ def outlying_frames(residuals: Array) -> Mask:
     seen: Mask = np.asarray(np.isfinite(residuals).all(-1))
     freedom = 2 * seen.sum((1, 2)) - 6
     square = np.sum(np.where(seen[..., None], residuals, 0.0) ** 2, axis=(1, 2, 3))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        reduced = np.where(freedom >= 2, square / np.maximum(freedom, 1), np.nan)
+    reduced = np.where(freedom >= 2, square / np.maximum(freedom, 1), np.nan)
     late = _at_fault_since_a_jump(residuals, np.where((seen.sum(axis=2) >= 2).all(axis=1), reduced, np.nan))
-    usual = np.where(late, np.nan, reduced)
-    if not np.isfinite(usual).any():
-        return np.zeros(len(residuals), bool)
-    return late | (np.nan_to_num(reduced) > OUTLYING * max(1.0, float(np.nanmedian(usual))))
+    return late | (np.nan_to_num(reduced) > OUTLYING * _middle(np.where(late, np.nan, reduced)))
 
 
 def _at_fault_since_a_jump(residuals: Array, reduced: Array) -> Mask:
@@ -104,14 +105,13 @@ def _at_fault_since_a_jump(residuals: Array, reduced: Array) -> Mask:
     both: Mask = np.asarray(np.isfinite(step).all(-1))
     square = 0.5 * np.sum(np.where(both[..., None], step, 0.0) ** 2, axis=(1, 2, 3))
     change = square / np.maximum(2 * both.sum((1, 2)) - 6, 1)
-    usual = np.fmax(_usual(change[:, None])[0][:, 0], 1.0)
+    usual = np.fmax(_usual(change)[0], 1.0)
     pieces = np.split(rows, np.flatnonzero((change > OUTLYING * usual) & (np.diff(rows) <= BLOCK)) + 1)
     long = np.array([len(piece) >= 2 for piece in pieces])  # a single frame is no reference for the others
     if not long.any():
         return np.zeros(len(reduced), bool)
-    first, last = (
-        np.array([np.median(reduced[piece[end]]) for piece in pieces]) for end in (slice(FEW), slice(-FEW, None))
-    )
+    first = np.array([np.median(reduced[piece[:FEW]]) for piece in pieces])
+    last = np.array([np.median(reduced[piece[-FEW:]]) for piece in pieces])
     best = int(np.argmin(np.where(long, np.maximum(first, last), np.inf)))
 
     def as_usual(left: int, right: int, kept: int) -> bool:
@@ -150,28 +150,23 @@ def judge_poses(fits: PoseFits, repeated: Mask, outlying: Mask, period: float, r
     status = np.full(len(struck), FrameStatus.MEASURED, np.uint8)
     freedom = fits.degrees_of_freedom
     reduced = np.where(outlying, np.nan, fits.reduced_chi_square)
-    middle = max(1.0, float(np.nanmedian(reduced))) if np.isfinite(reduced).any() else 1.0
+    middle = _middle(reduced)
     # a lasting fault raises the local median, so that of the whole recording limits it
-    usual = np.clip(np.nan_to_num(_usual(reduced[:, None])[0][:, 0], nan=middle), 1.0, OUTLYING * middle)
-    with np.errstate(invalid="ignore"):
-        square = fits.chi_square / usual
-        chance = np.where(freedom > 0, scipy.special.chdtrc(np.maximum(freedom, 1), square), 1.0)
-        factor = np.where(chance < SUSPECT, square / np.maximum(freedom, 1), 1.0)
+    usual = np.clip(np.nan_to_num(_usual(reduced)[0], nan=middle), 1.0, OUTLYING * middle)
+    square = fits.chi_square / usual
+    chance = np.where(freedom > 0, scipy.special.chdtrc(np.maximum(freedom, 1), square), 1.0)
+    factor = np.where(chance < SUSPECT, square / np.maximum(freedom, 1), 1.0)
     total = fits.used.sum(axis=(1, 2)) + struck
     contradicted = (chance < CHANCE) | (struck > np.maximum(MOST_STRUCK * total, 1))
     rest = _at_rest(fits)
     lost = repeated & ~_repeats_at_rest(repeated, rest)
     good = replace(fits, converged=fits.converged & ~contradicted & ~lost)
-    *one_sided, both = (
-        departure(good, weights) for weights in (differences(3, -3), differences(3, 0), differences(4, -2))
-    )
-    nearest = np.fmin(*one_sided)
-    moved = nearest / _quiet(nearest, rest)
+    before, after, both = (departure(good, differences(*of)) for of in ((3, -3), (3, 0), (4, -2)))
+    one_sided = np.fmin(before, after)
+    nearest = np.fmin(one_sided, both)
     # next to an end or a gap only the quadratic is available, which is far less accurate at a low frame rate
-    inner = np.fmin.reduce([*one_sided, both])
-    moved = np.where(np.isnan(both), moved, inner / _quiet(inner, rest))
-    with np.errstate(invalid="ignore"):
-        jumped = moved > _of_six(CHANCE) * 2.0  # a factor 2, as the motion is not quite smooth
+    moved = np.where(np.isnan(both), one_sided / _quiet(one_sided, rest), nearest / _quiet(nearest, rest))
+    jumped = moved > _of_six(CHANCE) * 2.0  # a factor 2, as the motion is not quite smooth
     status[jumped | disconnected_frames(good, period, radius)] = FrameStatus.JUMPED
     status[contradicted] = FrameStatus.CONTRADICTED
     status[lost] = FrameStatus.REPEATED
@@ -188,8 +183,7 @@ def _of_six(chance: float) -> float:
 def _quiet(moved: Array, rest: Mask) -> Array:
     """(n,) running median of squared departures over that of pure noise, at least 1."""
     # frames at rest are excluded, as they do not represent the motion
-    usual = _usual(np.where(rest, np.nan, moved)[:, None])[0][:, 0]
-    return np.fmax(usual / _of_six(0.5), 1.0)
+    return np.fmax(_usual(np.where(rest, np.nan, moved))[0] / _of_six(0.5), 1.0)
 
 
 def departure(fits: PoseFits, weights: Mapping[int, float]) -> Array:
@@ -254,10 +248,10 @@ def _broken(fits: PoseFits, last: Indices, first: Indices, period: float, radius
     """
     miss = np.full((2, len(last)), np.nan)
     n, R, t = len(fits.converged), fits.R_world_body, fits.t_world_body
-    variance = np.trace(fits.covariance[:, :3, :3], axis1=1, axis2=2)
-    turn_variance = np.trace(fits.covariance[:, 3:, 3:], axis1=1, axis2=2)
+    diagonal = np.diagonal(fits.covariance, axis1=1, axis2=2)
+    variance = np.stack([diagonal[:, :3].sum(axis=1), diagonal[:, 3:].sum(axis=1)])  # of positions, and of rotations
     gap = (first - last).astype(float)
-    reach = GREATEST_BLOW * period * gap
+    reach = GREATEST_BLOW * period * gap / np.array([[1.0], [radius]])
     for side, (here, there, beyond) in enumerate([(last, first, last - 1), (first, last, first + 1)]):
         known = (beyond >= 0) & (beyond < n) & fits.converged[np.clip(beyond, 0, n - 1)]
         here, there, beyond, g = here[known], there[known], beyond[known], gap[known]
@@ -265,13 +259,9 @@ def _broken(fits: PoseFits, last: Indices, first: Indices, period: float, radius
         rate = vector_from_rotation(R[here] @ np.swapaxes(R[beyond], 1, 2))
         carried = rotation_from_vector(g[:, None] * rate) @ R[here]
         turn = vector_from_rotation(R[there] @ np.swapaxes(carried, 1, 2))
-        noise, turn_noise = (
-            6.0 * np.sqrt(v[there] + (1 + g) ** 2 * v[here] + g**2 * v[beyond]) for v in (variance, turn_variance)
-        )
-        miss[side, known] = np.maximum(
-            np.linalg.norm(shift, axis=1) / (reach[known] + noise),
-            np.linalg.norm(turn, axis=1) / (reach[known] / radius + turn_noise),
-        )
+        noise = 6.0 * np.sqrt(variance[:, there] + (1 + g) ** 2 * variance[:, here] + g**2 * variance[:, beyond])
+        away = np.linalg.norm([shift, turn], axis=2)
+        miss[side, known] = np.max(away / (reach[:, known] + noise), axis=0)
     return np.asarray(np.nan_to_num(np.fmin(*miss)) > 1.0)
 
 
@@ -292,8 +282,7 @@ def _repeats_at_rest(repeated: Mask, rest: Mask) -> Mask:
 
 def _at_rest(fits: PoseFits) -> Mask:
     """(n,) True if the poses before and after differ by no more than their noise: then a repeat is no fault."""
-    with np.errstate(invalid="ignore"):
-        rest = departure(fits, {-1: -1, 1: 1}) < _of_six(SUSPECT)
+    rest = departure(fits, {-1: -1, 1: 1}) < _of_six(SUSPECT)
     if len(rest) > 1:
         rest[-1] = rest[-2]
     return np.asarray(rest)
