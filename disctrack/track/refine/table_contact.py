@@ -129,7 +129,7 @@ def table_from_disc(
     systematic[:, :3, :3] += left * e3[:, :, None] * e3[:, None, :]
     if source != "board":
         rig = _as_sure_as_both(rig, middle, gain, H, noise, by_disc, by_place, in_doubt)
-        fits, systematic, rig = _on_plane(fits, systematic, rig, told)
+        fits, rig = _on_plane(fits, systematic, rig, told)
     return fits, systematic, rig, told
 
 
@@ -209,9 +209,8 @@ def _contacts(
     """See `TableFromDisc`: plane, middle, d plane / d RIG_PARAMETERS (3, 30), covariance of the plane by noise, its
     changes by one tolerance of radius and thickness (3, 2), and by the pattern's position (3, k).
     """
-    with np.errstate(invalid="ignore"):
-        theta = np.arccos(np.clip(fits.R_world_body[:, 2, 2], -1, 1))
-        rows = np.flatnonzero(fits.converged & (theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1]))
+    theta = np.arccos(np.clip(fits.R_world_body[:, 2, 2], -1, 1))
+    rows = np.flatnonzero(fits.converged & (theta > THETA_RANGE[0]) & (theta < THETA_RANGE[1]))
     if len(rows) < MIN_FRAMES:
         return None
     R, t = fits.R_world_body[rows], fits.t_world_body[rows]
@@ -252,10 +251,11 @@ def _contacts(
     return plane, middle, by_rig, covariance, by_disc, gain @ gap_by_place
 
 
-def _on_plane(
-    fits: PoseFits, systematic: Array, rig: StereoRig, table: TableFromDisc
-) -> tuple[PoseFits, Array, StereoRig]:
-    """Poses, covariances and rig in the axes of a world moved onto the table; the origin moves along k only."""
+def _on_plane(fits: PoseFits, systematic: Array, rig: StereoRig, table: TableFromDisc) -> tuple[PoseFits, StereoRig]:
+    """Poses, covariances and rig in the axes of a world moved onto the table; the origin moves along k only.
+
+    The covariances `systematic`, and those of the poses, are altered.
+    """
     height, a, b = table.applied
     Q = frames.rotation_from_vector(np.array([b, -a, 0.0]))  # R_old_new
     shift = np.array([0.0, 0.0, height - table.applied[1:] @ table.middle])
@@ -266,4 +266,4 @@ def _on_plane(
             covariance[rows] = both @ covariance[rows] @ both.T
     moved = replace(fits, R_world_body=Q.T @ fits.R_world_body, t_world_body=(fits.t_world_body - shift) @ Q)
     rig = replace(rig, R_left_world=rig.R_left_world @ Q, t_left_world=rig.t_left_world + rig.R_left_world @ shift)
-    return moved, systematic, rig
+    return moved, rig
