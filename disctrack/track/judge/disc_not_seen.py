@@ -11,10 +11,11 @@ If other dots than declared are seen, each camera alone can identify them, at an
 images gives their positions in the unit of the rig, to some 0.2 mm: enough to say which declared number is wrong.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import chain, islice
 
+import cv2
 import numpy as np
 import scipy
 
@@ -30,12 +31,6 @@ from disctrack.track.judge.doubts import misplaced_dots
 from disctrack.track.pose import MIN_DOTS, DotsInFrames, dots_at
 from disctrack.track.refine.self_calibration import declared_places_kept, fit_shared
 
-Turn = Callable[[AnyArray], AnyArray]
-MIRRORED: dict[str, Turn] = {
-    "mirrored left to right": np.fliplr,
-    "mirrored top to bottom": np.flipud,
-    "turned by 180 deg": np.flip,
-}
 TURN, SHIFT = np.radians(1.0), 2e-3  # [rad], [m] prior sigmas of an unnoticed motion of a camera
 DOT_DIAMETERS_PX = (6.0, 18.0, 54.0, 162.0)  # each search finds blobs of a seventh to twice the diameter
 SIZE_TOLERANCE = 0.15  # blur and threshold make a blob larger or smaller than its dot
@@ -77,8 +72,8 @@ def _ways(pair: AnyArray, disc: Disc) -> Iterator[tuple[str, tuple[AnyArray, Any
     """Possible transformations of the images, with the images and the disc after undoing them."""
     left, right = pair
     yield "the left and right images are exchanged", (right, left), disc
-    for what, turn in MIRRORED.items():
-        one, other = np.ascontiguousarray(turn(left)), np.ascontiguousarray(turn(right))
+    for what, axis in (("mirrored left to right", 1), ("mirrored top to bottom", 0), ("turned by 180 deg", -1)):
+        one, other = cv2.flip(left, axis), cv2.flip(right, axis)  # -1: both axes
         since = "since the chessboard was seen"
         yield f"the images of both cameras are {what} {since}", (one, other), disc
         yield f"the {CAMERAS[0]} camera's images are {what} {since}", (one, right), disc
@@ -102,18 +97,15 @@ def moved_camera(pairs: AnyArray, rig: StereoRig, disc: Disc) -> Iterator[Findin
     sigma[PAIR_TURN], sigma[PAIR_SHIFT] = TURN, SHIFT
     found, _, reduced, _ = fit_shared(seen, sigma)
     rms, moved = acquisition.BLOB_PX * np.sqrt(reduced), rig.perturbed(found[:N_RIG])
-    turn = np.linalg.norm(vector_from_rotation(moved.R_right_left @ rig.R_right_left.T))
-    shift = np.linalg.norm(moved.t_right_left - rig.t_right_left)
+    turn_deg = float(np.degrees(np.linalg.norm(vector_from_rotation(moved.R_right_left @ rig.R_right_left.T))))
+    shift_mm = 1e3 * float(np.linalg.norm(moved.t_right_left - rig.t_right_left))
     if rms[-1] < MEETING_PX < rms[0]:
         text = (
-            f"the right camera was turned by about {np.degrees(turn):.1f} deg and shifted by {1e3 * shift:.0f} mm "
+            f"the right camera was turned by about {turn_deg:.1f} deg and shifted by {shift_mm:.0f} mm "
             f"against the left one since the calibration (what both see of the dots fits to {rms[-1]:.1f} px then, to "
             f"{rms[0]:.1f} as calibrated)"
         )
-        sizes = {
-            "turn": Measured(float(np.degrees(turn)), unit="deg"),
-            "shift": Measured(1e3 * float(shift), unit="mm"),
-        }
+        sizes = {"turn": Measured(turn_deg, unit="deg"), "shift": Measured(shift_mm, unit="mm")}
         advice = (Remedy(action="calibrate again"),)
         yield Finding(Kind.CAMERA_MOVED, Severity.DOUBT, text, Subject("track", "right"), sizes, advice, NONSENSE)
 
@@ -163,9 +155,7 @@ def _seen_dots(pair: AnyArray, rig: StereoRig, disc: Disc) -> Iterator[tuple[Mas
         reprojection error [px] of the triangulated points
     """
     for diameter in DOT_DIAMETERS_PX:
-        blobs = np.stack(
-            [acquisition.seen_by_one_camera(pair[camera], camera, diameter, rig, disc)[0] for camera in (0, 1)]
-        )
+        blobs = np.stack([acquisition.seen_by_one_camera(pair[c], c, diameter, rig, disc)[0] for c in (0, 1)])
         which: Mask = np.asarray(np.isfinite(blobs).all((0, 2)))
         if which.sum() <= MIN_DOTS:
             continue
