@@ -27,6 +27,8 @@ BLOB_PX = 0.5  # standard deviation of a blob's centroid under uneven light
 CANDIDATES = 40  # poses that are refined
 
 Pose = tuple[Array, Array]  # R_world_body (3, 3), t_world_body (3,) [m]
+# Pose to a fraction of a pixel, or None; dot images explained by blobs, in both cameras together; why there is no pose
+Found = tuple[Pose | None, int, str]
 
 
 def dot_blobs(image: AnyArray, expected_diameter_px: float) -> Array:
@@ -75,23 +77,17 @@ def expected_diameter_px(rig: StereoRig, disc: Disc) -> list[float]:
     return result
 
 
-def acquire(
-    pair: Sequence[AnyArray] | AnyArray, rig: StereoRig, disc: Disc, by_one: bool = True
-) -> tuple[Pose | None, int, str]:
+def acquire(pair: Sequence[AnyArray] | AnyArray, rig: StereoRig, disc: Disc, by_one: bool = True) -> Found:
     """Find the disc in the images of both cameras, at any position and attitude.
 
     by_one : use the dots of a single camera, too, if both together show too few; that takes four times as long
-    returns : the pose, to a fraction of a pixel, or None; number of dot images explained by blobs, in both cameras
-        together; the reason if no pose was found
     """
     diameters = expected_diameter_px(rig, disc)
     blobs = [dot_blobs(image, diameter)[:, :2] for image, diameter in zip(pair, diameters, strict=True)]
     return acquire_from_blobs(blobs, rig, disc, by_one)
 
 
-def acquire_from_blobs(
-    blobs: list[Array], rig: StereoRig, disc: Disc, by_one: bool = True
-) -> tuple[Pose | None, int, str]:
+def acquire_from_blobs(blobs: list[Array], rig: StereoRig, disc: Disc, by_one: bool = True) -> Found:
     """As `acquire` from the centroids of candidate blobs in the left and in the right image, each (k, 2)."""
     candidates = _candidates_from_stereo(blobs, rig, disc)
     pose, explained = _best_explanation(candidates, blobs, rig, disc)
@@ -99,14 +95,14 @@ def acquire_from_blobs(
         for camera in (0, 1):
             candidates += _candidates_from_one_camera(blobs[camera], camera, rig, disc)
         pose, explained = _best_explanation(candidates, blobs, rig, disc)
-    reason = ""
-    if pose is None:
-        counts = " and ".join(f"{len(b)} in the {name}" for b, name in zip(blobs, CAMERAS, strict=True))
-        reason = (
-            f"no arrangement of the blobs found ({counts} image) matches the {disc.n_markers} dots of [markers]: "
-            "is the upper face visible, are diameter and centres right, does the rig belong to these images?"
-        )
-    return pose, explained, reason
+    if pose is not None:
+        return pose, explained, ""
+    counts = " and ".join(f"{len(b)} in the {name}" for b, name in zip(blobs, CAMERAS, strict=True))
+    reason = (
+        f"no arrangement of the blobs found ({counts} image) matches the {disc.n_markers} dots of [markers]: "
+        "is the upper face visible, are diameter and centres right, does the rig belong to these images?"
+    )
+    return None, explained, reason
 
 
 def seen_by_one_camera(

@@ -18,8 +18,6 @@ from disctrack.analyse.quantities import SIGMAS
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader
 
-Pair = tuple[AnyArray, AnyArray]
-
 STRIDE = 16  # frames between two samples; irregular by up to 5, so that no period of the disc is in step with them
 MARGIN = 0.25  # [s] kept before the last frame at rest: a disc that tips over starts too slowly to be seen
 MIN_PIXELS = 12  # in the image of half size: fewer are hot pixels or an insect
@@ -92,7 +90,6 @@ def find_motion(left: FrameReader, right: FrameReader, start: int, stop: int, fr
 
 def _last_still(left: FrameReader, right: FrameReader, frames: range) -> tuple[int | None, int]:
     """Last of the sampled frames before one that differs from the first, None if none does; number of pairs read."""
-    scenes: list[Pair] = []
     last, looked = frames[0], 0
     for frame in _looks(frames):
         try:
@@ -100,9 +97,10 @@ def _last_still(left: FrameReader, right: FrameReader, frames: range) -> tuple[i
         except RecordingError:
             continue
         looked += 1
-        if len(scenes) < 2:
-            scenes.append(pair)
-            still = tuple(map(still_scene, scenes[0], pair))
+        if looked == 1:
+            first = pair
+        elif looked == 2:
+            still = tuple(map(still_scene, first, pair))
         elif any(differs(image) for differs, image in zip(still, pair, strict=True)):
             return last, looked
         last = frame
