@@ -1,7 +1,5 @@
 """Pictures of a measurement: coordinates with their sigmas, reprojection error, residual per dot."""
 
-from collections.abc import Callable
-
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -100,8 +98,4 @@ def dots_figure(trajectory: Trajectory) -> Figure:
     return figure
 
 
-FIGURES: dict[str, Callable[[Trajectory], Figure]] = {
-    "coordinates": coordinates_figure,
-    "reprojection": reprojection_figure,
-    "dots": dots_figure,
-}
+FIGURES = {"coordinates": coordinates_figure, "reprojection": reprojection_figure, "dots": dots_figure}

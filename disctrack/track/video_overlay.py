@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from calibration.kit.arguments import checked
-from calibration.kit.arrays import AnyArray, Array, Codes, Mask
+from calibration.kit.arrays import AnyArray, Array, Mask
 from calibration.kit.grey_levels import full_scale
 from disctrack.errors import OutputError
 from disctrack.files.whole import whole_file
@@ -82,8 +82,11 @@ def draw_pair(images: AnyArray, trajectory: Trajectory, row: int) -> ColourImage
         cv2.cvtColor(cv2.convertScaleAbs(image, alpha=255 / full_scale(image)), cv2.COLOR_GRAY2BGR, dst=picture)
     if trajectory.measured[row]:
         _draw_disc(pictures, trajectory, row)
+    dots, states = trajectory.markers_px[row], trajectory.marker_status[row]
     for camera, picture in enumerate(pictures):
-        _draw_centres(picture, trajectory.markers_px[row, camera], trajectory.marker_status[row, camera])
+        for point, status in zip(dots[camera], states[camera], strict=True):
+            colour = "centre" if status == MarkerStatus.MEASURED else "refused"
+            _cross(picture, point, colour, cv2.MARKER_CROSS, 7)
         _write(picture, 0, CAMERAS[camera], "text")
     for line, text in enumerate(captions):
         _write(whole[height:], line, text, "text" if trajectory.measured[row] else "refused")
@@ -116,8 +119,10 @@ def _draw_disc(pictures: list[ColourImage], trajectory: Trajectory, row: int) ->
     disc, rig = trajectory.disc, trajectory.rig
     R, t = rotation_from_quaternion(trajectory.quaternion[row]), trajectory.q[row, :3]
     h = disc.half_thickness
-    lower, upper = (disc.radius * _circle() + [0.0, 0.0, z] for z in (-h, h))
-    dots = disc.marker_centres_body[:, None] + 0.5 * disc.marker_diameter * _circle()
+    angle = np.linspace(0, 2 * np.pi, POINTS, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(POINTS)], axis=-1)
+    lower, upper = (disc.radius * circle + [0.0, 0.0, z] for z in (-h, h))
+    dots = disc.marker_centres_body[:, None] + 0.5 * disc.marker_diameter * circle
     outlines = np.stack([lower, upper, *dots]) @ R.T + t
     lower = outlines[0]
     _, e2, e3 = nodal_axes_world(*trajectory.q[row, 3:5])
@@ -132,13 +137,7 @@ def _draw_disc(pictures: list[ColourImage], trajectory: Trajectory, row: int) ->
         _polylines(picture, [np.roll(lower_px, -start, axis=0)[visible]], "lower rim", closed=bool(facing.all()))
         _polylines(picture, [upper_px], "upper rim")
         _polylines(picture, dots_px, "dot")
-        if np.isfinite(seen[-1]).all():
-            _cross(picture, seen[-1], "contact", cv2.MARKER_DIAMOND, 9)
-
-
-def _circle() -> Array:
-    angle = np.linspace(0, 2 * np.pi, POINTS, endpoint=False)
-    return np.stack([np.cos(angle), np.sin(angle), np.zeros(POINTS)], axis=-1)
+        _cross(picture, seen[-1], "contact", cv2.MARKER_DIAMOND, 9)
 
 
 def _polylines(picture: ColourImage, lines: Sequence[Array] | Array, colour: str, closed: bool = True) -> None:
@@ -150,15 +149,10 @@ def _polylines(picture: ColourImage, lines: Sequence[Array] | Array, colour: str
         cv2.polylines(picture, fixed, closed, _COLOURS[colour], 1, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
-def _draw_centres(picture: ColourImage, pixels: Array, status: Codes) -> None:
-    for point, state in zip(pixels, status, strict=True):
-        if np.isfinite(point).all():
-            _cross(picture, point, "centre" if state == MarkerStatus.MEASURED else "refused", cv2.MARKER_CROSS, 7)
-
-
 def _cross(picture: ColourImage, point: Array, colour: str, kind: int, size: int) -> None:
-    x, y = np.clip(np.rint(point), -10000, 10000).astype(int)
-    cv2.drawMarker(picture, (int(x), int(y)), _COLOURS[colour], kind, size, 1, cv2.LINE_AA)
+    if np.isfinite(point).all():
+        x, y = np.clip(np.rint(point), -10000, 10000).astype(int)
+        cv2.drawMarker(picture, (int(x), int(y)), _COLOURS[colour], kind, size, 1, cv2.LINE_AA)
 
 
 @contextlib.contextmanager
