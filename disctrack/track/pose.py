@@ -147,15 +147,14 @@ def fit_poses(seen: DotsInFrames, *, reject_outliers: bool = True, with_sensitiv
     """
     n, rig = len(seen.t), seen.rig
     there = np.asarray(np.isfinite(seen.pixels).all(-1))
-    posed = np.asarray(np.isfinite(seen.R).all((1, 2)) & np.isfinite(seen.t).all(1))
-    used = there & np.isfinite(seen.covariance).all((-1, -2)) & posed[:, None, None]
+    used = there & np.isfinite(seen.covariance).all((-1, -2)) & seen.posed[:, None, None]
     observed = np.where(there[..., None], seen.pixels, 0.0)
     covariance = np.ascontiguousarray(seen.covariance, float)
     R, t = np.array(seen.R, float, order="C"), np.array(seen.t, float, order="C")
     good = np.zeros(n, bool)
     shape, centres = observed.shape, np.ascontiguousarray(seen.disc.marker_centres_body, float)
     filled = pixels, whitened, JW = np.full(shape, np.nan), np.zeros(shape), np.zeros((*shape, 6))
-    rows = np.flatnonzero(posed)
+    rows = np.flatnonzero(seen.posed)
     while rows.size:
         kernel.fit(rows, observed, covariance, used, stacked(rig), centres, TOLERANCE, R, t, good, filled)
         rows = _strike_worst_dot(whitened, JW, used, rows) if reject_outliers else rows[:0]

@@ -95,8 +95,7 @@ def exposure_of(
 
     found : (2, 2) as from `exposure_by_smear`; longest : [s] the frame interval, which no exposure exceeds.
     """
-    words = [_in_words(*each) for each in zip(CAMERAS, *found, strict=True)]
-    smears = ", ".join(text for text in words if text)
+    smears = ", ".join(filter(None, map(_in_words, CAMERAS, *found)))
     if declared is None:
         seconds = _common(found, longest)
         note = f"exposure by the smear of the moving dots: {smears}; poses are of the middle of {1e6 * seconds:.0f} µs"
