@@ -277,8 +277,7 @@ def _checks(scene: Scene) -> Iterator[tuple[bool, str, object, str]]:
     yield n < 3, "markers.centres_mm", f"{n} rows", "3 or more"
     yield reach_mm > scene.disc.radius_mm, "markers.centres_mm", "a dot over the disc's rim", "dots on the face"
     yield len(misprints) not in (0, n), "faults.misprint_mm", f"{len(misprints)} rows", f"one per dot ({n})"
-    outside = any(not 0 <= k < n for k in hidden)
-    yield outside, "faults.hidden_markers", hidden, f"numbers from 0 to {n - 1}"
+    yield any(not 0 <= k < n for k in hidden), "faults.hidden_markers", hidden, f"numbers from 0 to {n - 1}"
     cameras, hot, light = scene.cameras, scene.sensor.hot_pixels, scene.light.direction
     yield cameras.bit_depth not in (8, 10, 12, 16), "cameras.bit_depth", cameras.bit_depth, "8, 10, 12, 16"
     pixels = math.prod(cameras.image_size)

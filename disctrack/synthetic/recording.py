@@ -95,8 +95,6 @@ def run_render(
                 (part / name).mkdir(parents=True)
             (part / "recording.toml").write_text(recording_toml(scene), encoding="utf-8")
             _write_all([*_boards(part, scene, truth), *_frames(part, scene, pose, truth)], scene, progress)
-            if target is not None:
-                target.parent.mkdir(parents=True, exist_ok=True)
             _write_truth(target or part / TRUTH_NAME, truth, scene)
             if folder.exists():
                 folder.rmdir()
@@ -198,7 +196,8 @@ def recording_toml(scene: Scene) -> str:
 
 
 def _write_truth(path: Path, truth: Truth, scene: Scene) -> None:
-    """Write `truth` and its scene."""
+    """Write `truth` and its scene, and create the folder if necessary."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     pose, disc = ", ".join(f"{c} {'m' if c in 'xyz' else 'rad'}" for c in COORDINATES), truth.disc
     datasets = (
         ("time", truth.time, "s", "mid exposure of the left camera"),

@@ -69,12 +69,9 @@ def run_simulate(
     rate = scene.cameras.frame_rate_hz if rate is None else rate
     duration = max(scene.cameras.n_frames - 1, 1) / scene.cameras.frame_rate_hz if duration is None else duration
     motion = simulate(rolling_model(scene), rolling_start(scene), duration, rate=rate)
-    attributes = {
-        "name": scene.name,
-        "scene": scene_path.read_text(encoding="utf-8"),
-        "settings": json.dumps({"duration_s": duration, "rate_hz": rate}),
-    }
-    write_motion(output, motion, attributes)
+    settings = json.dumps({"duration_s": duration, "rate_hz": rate})
+    text = scene_path.read_text(encoding="utf-8")
+    write_motion(output, motion, {"name": scene.name, "scene": text, "settings": settings})
     return SimulationRun(output, motion, f"{output}\n{summary(motion)}\neffects: {effects_in_words(scene)}")
 
 

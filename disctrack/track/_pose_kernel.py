@@ -150,6 +150,5 @@ def fit(rows, observed, covariance, used, cameras, centres, tolerance, R, t, con
     """
     pixels, residuals, jacobian = filled
     for f in rows:
-        of_frame = pixels[f], residuals[f], jacobian[f]
         converged[f] = fit_pose(observed[f], covariance[f], used[f], cameras, centres, tolerance, np.inf, R[f], t[f],
-                                of_frame)  # fmt: skip
+                                (pixels[f], residuals[f], jacobian[f]))  # fmt: skip
