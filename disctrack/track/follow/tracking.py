@@ -88,9 +88,8 @@ def track(
         read_blocks = _without(read_blocks, frames.CAMERAS.index(finding.subject.camera), finding.subject.frames[0][0])
         tracking = measured(disc, lambda n: None)
     found = tracking.trajectory.disc
-    if np.abs(found.marker_centres_body - disc.marker_centres_body).max() > LOOK_AGAIN and not _faulty(
-        tracking.trajectory.findings
-    ):
+    off = np.abs(found.marker_centres_body - disc.marker_centres_body).max()
+    if off > LOOK_AGAIN and not _faulty(tracking.trajectory.findings):
         tracking = measured(found, lambda n: None)
     noticed = (*dropped, *tracking.trajectory.findings)
     arranged = why_not_seen(_conflicts(tracking, noticed, read_blocks, pairs), rig, disc)
@@ -106,11 +105,8 @@ def _check_dots(disc: Disc) -> None:
     """Raise TrackingError unless the dots determine a pose."""
     spread = disc.marker_centres_body - disc.marker_centres_body.mean(axis=0)
     if disc.n_markers < 3 or np.linalg.matrix_rank(spread, tol=0.1 * disc.marker_diameter) < 2:
-        raise TrackingError(
-            f"[markers] declares {disc.n_markers} dots"
-            + (" on one line" if disc.n_markers > 2 else "")
-            + ": a pose needs at least three dots that are not on one line"
-        )
+        declared = f"[markers] declares {disc.n_markers} dots{' on one line' if disc.n_markers > 2 else ''}"
+        raise TrackingError(f"{declared}: a pose needs at least three dots that are not on one line")
 
 
 def _dropped(tracking: Measurement, read_blocks: ReadBlocks, pairs: range, begin: Follower) -> tuple[Finding, ...]:
@@ -131,7 +127,7 @@ def _apart(tracking: Measurement) -> Mask:
     """(n,) frames that were searched in both images, and whose dots contradict each other."""
     status = tracking.trajectory.frame_status
     looked = (tracking.trajectory.marker_status != MarkerStatus.NOT_LOOKED_FOR).any(axis=2).all(axis=1)
-    return looked & ((status == FrameStatus.ONE_CAMERA) | (status == FrameStatus.CONTRADICTED))
+    return looked & np.isin(status, [FrameStatus.ONE_CAMERA, FrameStatus.CONTRADICTED])
 
 
 def _without(read_blocks: ReadBlocks, camera: int, since: int) -> ReadBlocks:
@@ -227,28 +223,25 @@ def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, l
     """Blocks corrected for a colour filter's pattern and stuck pixels, and both as findings."""
     # evenly spread: within a millisecond the disc moves by less than a pixel, and its edges would look stuck, too
     images = _some(read_blocks, pairs)
-    sensors, said = [], []
+    corrections: list[tuple[int, Callable[[AnyArray, AnyArray], None], AnyArray]] = []
+    said = []
     for camera, name in enumerate(frames.CAMERAS):
-        pattern = mosaic_gains(images[:, camera])
-        if pattern is not None:
-            images[:, camera] = _without_mosaic(images[:, camera], pattern)
-            gains = " ".join(f"{gain:.2f}" for gain in pattern.ravel())
+        if (gains := mosaic_gains(images[:, camera])) is not None:
+            _divide_by_mosaic(images[:, camera], gains)
+            corrections.append((camera, _divide_by_mosaic, gains))
+            listed = " ".join(f"{gain:.2f}" for gain in gains.ravel())
             what = "they are divided by it, which is right for grey discs only; a monochrome camera sees more"
-            said.append((name, f"a colour filter lies on the sensor (gains of neighbouring pixels {gains}): {what}"))
-        mask = stuck_pixels(images[:, camera])
-        if mask is not None:
-            said.append((name, f"{mask.sum()} pixels show one value whatever passes; their neighbours stand in"))
-        sensors.append((pattern, mask))
+            said.append((name, f"a colour filter lies on the sensor (gains of neighbouring pixels {listed}): {what}"))
+        if (stuck := stuck_pixels(images[:, camera])) is not None:
+            corrections.append((camera, repair, stuck))
+            said.append((name, f"{stuck.sum()} pixels show one value whatever passes; their neighbours stand in"))
     if not said:
         return read_blocks, []
 
     def repaired(block: PairBlock) -> PairBlock:
         images = block.images.copy()  # they may be the caller's own
-        for camera, (pattern, mask) in enumerate(sensors):
-            if pattern is not None:
-                images[:, camera] = _without_mosaic(images[:, camera], pattern)
-            if mask is not None:
-                repair(images[:, camera], mask)
+        for camera, correct, by in corrections:
+            correct(images[:, camera], by)
         return replace(block, images=images)
 
     return lambda start, stop: map(repaired, read_blocks(start, stop)), [
@@ -256,11 +249,11 @@ def _as_one_sensor(read_blocks: ReadBlocks, pairs: range) -> tuple[ReadBlocks, l
     ]
 
 
-def _without_mosaic(images: AnyArray, gains: AnyArray) -> AnyArray:
-    """Images (..., height, width), uint8 or uint16, divided by the gains (2, 2) of the colour filter."""
+def _divide_by_mosaic(images: AnyArray, gains: AnyArray) -> None:
+    """Divide, in place, images (..., height, width), uint8 or uint16, by the gains (2, 2) of the colour filter."""
     height, width = images.shape[-2:]
     pattern = np.tile(gains, (height // 2 + 1, width // 2 + 1))[:height, :width]
-    return np.clip(np.rint(images / pattern), 0, np.iinfo(images.dtype).max).astype(images.dtype)
+    images[...] = np.clip(np.rint(images / pattern), 0, np.iinfo(images.dtype).max)
 
 
 def _discontinuous(tables: Tables, edge: int) -> bool:
