@@ -84,10 +84,7 @@ def open_pairs(recording: Recording, frames: tuple[int | None, int | None] = (No
         >>> len(open_pairs("clip", frames=(100, 200)))
         100
     """
-    readers = [
-        open_frames(pattern, recording.folder, camera)
-        for pattern, camera in zip((recording.left, recording.right), CAMERAS, strict=True)
-    ]
+    readers = [open_frames(getattr(recording, camera), recording.folder, camera) for camera in CAMERAS]
     readers = flat_fielded(readers, flat_fields(recording.folder, recording.sensors))
     left, right = frames_in_parts(readers, recording.parts, str(recording.file))
     headers = [*check_headers(left, right, recording.frame_rate, recording.exposure, str(recording.file))]
@@ -157,12 +154,8 @@ def measure(
         *found.trajectory.findings,
         *(() if boards is None else boards.findings),
     )
-    details = {
-        **found.details,
-        "unreadable": [*found.unreadable.values()],
-        "first_pass": asdict(span),
-        **pairs.camera_headers(),
-    }
+    reading = {"unreadable": [*found.unreadable.values()], "first_pass": asdict(span)}
+    details = {**found.details, **reading, **pairs.camera_headers()}
     trajectory = at_full_length(found.trajectory, len(pairs.left), span.start, stamps)
     for still in (slice(pairs.start, span.start), slice(span.stop, pairs.stop)):
         trajectory.frame_status[still] = FrameStatus.STILL
