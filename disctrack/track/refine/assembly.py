@@ -105,8 +105,6 @@ def assemble(
     shared = _shared_sigma(fits, systematic, rig, moved)
     seen = replace(seen, rig=rig)
     trajectory = trajectory_of(seen, fits, systematic, status, tables.status, taken)
-    if table is not None:
-        trajectory = replace(trajectory, table_moved=table.beyond)
     doubts = doubts_of(first, scatter, shaken, table, trajectory, seen)
     details = {
         "exposure_s": list(exposure),  # for which the dots were corrected
@@ -118,9 +116,12 @@ def assemble(
         "variance_factor": scatter.whole,
         "noise_factor": scatter.noise,
         "systematic_px": list(scatter.systematic_px),
-        **as_built.details,
+        "size": {"by_dots": as_built.size, "sigma": as_built.size_sigma, "share": as_built.size_share},
+        "marker_shift_um": (1e6 * as_built.marker_shift[:, :2]).round(3).tolist(),
+        "marker_shift_sigma_um": (1e6 * as_built.marker_shift_sigma).round(3).tolist(),
     }
     if table is not None:
+        trajectory = replace(trajectory, table_moved=table.beyond)
         details["table"] = table.details(trajectory.q[:, 4], seen.disc)
     findings = (*repeated_images(repeated, trajectory), *of_exposure, *of_motion, *doubts)
     return Measurement(replace(trajectory, findings=findings), details)
@@ -161,11 +162,8 @@ def _scattered(
     fits: PoseFits, covariance: Array, faults: AsBuilt | None, outlying: Mask
 ) -> tuple[PoseFits, Array, Scatter]:
     """Poses with covariances scaled to the noise found, systematic covariance (n, 6, 6), and the scatter."""
-    ordinary = replace(
-        fits,
-        degrees_of_freedom=np.where(outlying, 0, fits.degrees_of_freedom),
-        used=fits.used & ~outlying[:, None, None],
-    )
+    freedom = np.where(outlying, 0, fits.degrees_of_freedom)
+    ordinary = replace(fits, degrees_of_freedom=freedom, used=fits.used & ~outlying[:, None, None])
     scatter = split_scatter(ordinary, covariance, None if faults is None else faults.reduced_chi_square)
     covariance[...] *= scatter.noise  # in place
     systematic = fits.covariance * scatter.systematic
@@ -212,12 +210,7 @@ def status_of(followed: Codes, fits: PoseFits) -> Codes:
 
 
 def trajectory_of(
-    seen: DotsInFrames,
-    fits: PoseFits,
-    systematic: Array,
-    status: Codes,
-    located: Codes,
-    taken: Taken,
+    seen: DotsInFrames, fits: PoseFits, systematic: Array, status: Codes, located: Codes, taken: Taken
 ) -> Trajectory:
     """The trajectory of the fitted poses; rejected poses become NaN in the arrays of `fits`, too.
 

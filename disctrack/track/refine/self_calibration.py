@@ -21,7 +21,6 @@ scale of the rig is corrected by its share.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -55,15 +54,6 @@ class AsBuilt:
     size: float = 0.0  # relative excess of lengths by the dots (if as declared) over those by the board
     size_sigma: float = float("nan")  # of the dots as a ruler
     size_share: float = 0.0  # fraction of the excess by which the rig was enlarged
-
-    @property
-    def details(self) -> dict[str, Any]:
-        """Of JSON's types."""
-        return {
-            "size": {"by_dots": self.size, "sigma": self.size_sigma, "share": self.size_share},
-            "marker_shift_um": (1e6 * self.marker_shift[:, :2]).round(3).tolist(),
-            "marker_shift_sigma_um": (1e6 * self.marker_shift_sigma).round(3).tolist(),
-        }
 
     @classmethod
     def moved(cls, rig: StereoRig, disc: Disc, shift: Array, covariance: Array, reduced_chi_square: float) -> AsBuilt:
@@ -114,8 +104,7 @@ def fit_shared(
         frames, fits = frames.fitted(iteration > 0, shift)
         ok = fits.converged
         reduced.append(float(fits.chi_square[ok].sum() / max(fits.degrees_of_freedom[ok].sum(), 1)))
-        used = fits.used & ok[:, None, None]
-        normal, gradient, _ = frames.normal(shift, used, free)
+        normal, gradient, _ = frames.normal(shift, fits.used, free)
         # excess scatter of the dots over the image noise reduces their weight
         scale = share / _residual_scatter(fits, normal, gradient)
         matrix = scale * normal + information
