@@ -98,8 +98,11 @@ def misplaced_dots(declared: Disc, found: Array) -> tuple[Finding, ...]:
     return (Finding(Kind.DOTS_MISPLACED, Severity.DOUBT, text, of, remedies=(remedy,)),)
 
 
-def _shaken(factor: Array, trajectory: Trajectory) -> tuple[Finding, ...]:
-    """Poses that scatter far more than the noise of the dots predicts, and by how much."""
+def poses_scatter(factor: Array, trajectory: Trajectory) -> tuple[Finding, ...]:
+    """Poses that scatter far more than the noise of the dots predicts, and by how much.
+
+    factor : (6,) on the variances of the POSE_COMPONENTS
+    """
     variance = np.nanmedian(np.diagonal(trajectory.pose_covariance[trajectory.measured], axis1=1, axis2=2), axis=0)
     over = []
     for name, group in CHANNELS.items():
@@ -135,26 +138,13 @@ def _misfit(seen: str, ahead: float, explained: float, frame_rate: float) -> Fin
         f"the {early} camera is {abs(ahead):.2f} frames ({1e3 * abs(ahead) / frame_rate:.2f} ms) ahead of the {late} "
         f"one, which explains {100 * explained:.0f} % of this: {seen}. `disctrack diagnose` measures a constant delay"
     )
-    return Finding(
-        Kind.DELAY,
-        Severity.DOUBT,
-        text,
-        Subject("track", early),
-        {"delay": Measured(abs(ahead) / frame_rate, unit="s")},
-        (Remedy(action=again or "check the synchronisation"),),
-        MISFITS,
-    )
+    size = {"delay": Measured(abs(ahead) / frame_rate, unit="s")}
+    advice = (Remedy(action=again or "check the synchronisation"),)
+    return Finding(Kind.DELAY, Severity.DOUBT, text, Subject("track", early), size, advice, MISFITS)
 
 
-def doubts_of(
-    follower: Follower,
-    scatter: Scatter,
-    shaken: Array,
-    table: TableFromDisc | None,
-    trajectory: Trajectory,
-    seen: DotsInFrames,
-) -> tuple[Finding, ...]:
-    """All findings of the tracking about its own result.
+def doubts_of(follower: Follower, scatter: Scatter, trajectory: Trajectory, seen: DotsInFrames) -> list[Finding]:
+    """Frames that are lost, dots that are not as declared, and dots that miss their poses or scatter.
 
     seen : the dots, with the poses that were fitted to them
     """
@@ -172,11 +162,10 @@ def doubts_of(
         )
         explains = Kind.FRAMES_LOST, Kind.ACCURACY
         found.append(Finding(Kind.DOTS_SCATTER, Severity.WARNING, text, explains=explains))
-    found += _shaken(shaken, trajectory)
-    return (*found, *_table_disagrees(table, trajectory))
+    return found
 
 
-def _table_disagrees(table: TableFromDisc | None, trajectory: Trajectory) -> tuple[Finding, ...]:
+def table_disagrees(table: TableFromDisc | None, trajectory: Trajectory) -> tuple[Finding, ...]:
     """Disagreement of board and disc about the table beyond their tolerances; else a disc that is not on the table."""
     apart = table is not None and abs(table.plane[0]) > NO_TOLERANCE
     severity = Severity.DOUBT if apart else Severity.WARNING

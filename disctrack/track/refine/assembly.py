@@ -15,7 +15,7 @@ from disctrack.recording.readers.blocks import NotRead
 from disctrack.track.dots.template import dot_centres
 from disctrack.track.follow.following import Follower, Tables, repeats
 from disctrack.track.judge.cameras import camera_motion
-from disctrack.track.judge.doubts import FAULTY, doubts_of, repeated_images
+from disctrack.track.judge.doubts import FAULTY, doubts_of, poses_scatter, repeated_images, table_disagrees
 from disctrack.track.judge.outlier_tests import judge_poses, outlying_frames, unexpected_misfit
 from disctrack.track.pose import MIN_DOTS, DotsInFrames, PoseFits, dots_at, fit_poses, whitening
 from disctrack.track.refine.dot_shifts import exposure_by_smear, exposure_of, shift_by_exposure, shift_by_glare
@@ -102,16 +102,14 @@ def assemble(
     # after the table: the excess scatter of the poses may be correlated, and would not average out in its fit
     *_, shaken = scatter_of_poses(fits)
     fits.covariance[...] *= np.sqrt(np.outer(shaken, shaken))
-    shared = _shared_sigma(fits, systematic, rig, moved)
     seen = replace(seen, rig=rig)
     trajectory = trajectory_of(seen, fits, systematic, status, tables.status, taken)
-    doubts = doubts_of(first, scatter, shaken, table, trajectory, seen)
     details = {
         "exposure_s": list(exposure),  # for which the dots were corrected
         "blur_px": [edge.blur_px for edge in first.edges],
         "noise": [edge.noise._asdict() for edge in first.edges],
         "pose_variance_factor": shaken.round(3).tolist(),  # scatter about a smooth motion over that by the dots
-        "shared_sigma": shared,
+        "shared_sigma": _shared_sigma(fits, systematic, rig, moved),
         "acquisitions": sum(f.acquisitions for f in followers),  # number of successful searches
         "variance_factor": scatter.whole,
         "noise_factor": scatter.noise,
@@ -123,7 +121,9 @@ def assemble(
     if table is not None:
         trajectory = replace(trajectory, table_moved=table.beyond)
         details["table"] = table.details(trajectory.q[:, 4], seen.disc)
-    findings = (*repeated_images(repeated, trajectory), *of_exposure, *of_motion, *doubts)
+    doubts = [*doubts_of(first, scatter, trajectory, seen), *poses_scatter(shaken, trajectory)]
+    of_table = table_disagrees(table, trajectory)
+    findings = (*repeated_images(repeated, trajectory), *of_exposure, *of_motion, *doubts, *of_table)
     return Measurement(replace(trajectory, findings=findings), details)
 
 
