@@ -22,8 +22,7 @@ from disctrack.report.blocks import Facts, Report, document
 from disctrack.report.html import link_pages
 from disctrack.report.terminal import show
 from disctrack.track import run_summary as summary
-from disctrack.track.follow.tracking import TrackingSettings
-from disctrack.track.measurement import ImagePairs, measure, trajectory_provenance
+from disctrack.track.measurement import ImagePairs, TrackingSettings, measure, trajectory_provenance
 from disctrack.track.video_overlay import shown_rows, write_overlay
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.exchange.motion import write_csv

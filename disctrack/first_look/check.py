@@ -22,8 +22,8 @@ from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import Recording, read_recording
 from disctrack.recording.readers.blocks import NotRead
 from disctrack.report.blocks import Facts, Report, Section
-from disctrack.track.follow.tracking import Measurement, Taken, TrackingSettings, track
-from disctrack.track.measurement import ImagePairs, check_rig, exposures, images_lost, open_pairs
+from disctrack.track.follow.tracking import Measurement, Taken, track
+from disctrack.track.measurement import ImagePairs, TrackingSettings, check_rig, exposures, images_lost, open_pairs
 from disctrack.track.run_summary import left_out, sigma_text
 from disctrack.trajectory import Trajectory, joined
 
@@ -174,8 +174,8 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
         total += n
         try:
             settings = TrackingSettings(first_pass=False, exposure=exposures(recording, pairs)[0])
-            taken = Taken(frames, recording.frame_rate, recording.gravity)
-            tracking = track(pairs.reading(seen.not_read), taken, rig, recording.disc, settings)
+            taken = Taken(frames, recording.frame_rate, recording.gravity, settings=settings)
+            tracking = track(pairs.reading(seen.not_read), taken, rig, recording.disc)
             done.append((frames, tracking))
             noticed += [*tracking.trajectory.findings, *lost_pairs(tracking.trajectory)]
         except DiscTrackError as error:

@@ -144,8 +144,8 @@ def measure(
     began = time.perf_counter()
     span = _span(pairs, recording.frame_rate, settings)
     progress(len(pairs) - (span.stop - span.start))
-    taken = Taken(range(span.start, span.stop), recording.frame_rate, recording.gravity, stamps)
-    found = _tracked(recording, rig, pairs, settings, taken, threads or default_threads(), progress)
+    taken = Taken(range(span.start, span.stop), recording.frame_rate, recording.gravity, stamps, settings)
+    found = _tracked(recording, rig, pairs, taken, threads or default_threads(), progress)
     seconds = time.perf_counter() - began
     findings = (
         *pairs.findings,
@@ -210,8 +210,8 @@ def measure_pairs(
             yield PairBlock(np.arange(rows.start, rows.stop), pair)
 
     began = time.perf_counter()
-    taken = Taken(range(n), frame_rate, gravity, times)
-    found = track(read_blocks, taken, rig, disc, settings, threads, progress)
+    taken = Taken(range(n), frame_rate, gravity, times, settings or TrackingSettings())
+    found = track(read_blocks, taken, rig, disc, threads, progress)
     seconds = time.perf_counter() - began
     findings = contradictions(found.trajectory, disc, noticed=found.trajectory.findings)
     warn_of_doubts(findings)
@@ -235,13 +235,7 @@ def _sides(images: Images | tuple[Images, Images]) -> tuple[Images, Images]:
 
 
 def _tracked(
-    recording: Recording,
-    rig: StereoRig,
-    pairs: ImagePairs,
-    settings: TrackingSettings,
-    taken: Taken,
-    threads: int,
-    progress: Progress,
+    recording: Recording, rig: StereoRig, pairs: ImagePairs, taken: Taken, threads: int, progress: Progress
 ) -> Measurement:
     """Track the disc through the pairs taken."""
     not_read: NotRead = {}  # a dictionary, as some images are read twice
@@ -250,7 +244,7 @@ def _tracked(
         workers = max(1, min(threads, len(stretch_edges(taken.pairs, recording.disc)) - 1))
     reading = pairs.reading(not_read, max(1, threads // workers))  # each worker has its own three blocks
     try:
-        found = track(reading, taken, rig, recording.disc, settings, workers, progress)
+        found = track(reading, taken, rig, recording.disc, workers, progress)
     except TrackingError as error:
         refuse_unreadable(recording, not_read, 2 * len(taken.pairs), error)
         error.findings = with_square(error.findings, recording)

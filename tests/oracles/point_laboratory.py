@@ -17,7 +17,7 @@ from disctrack.frames import rotation_from_quaternion, vector_from_rotation
 from disctrack.track.dots._kernels import DOT
 from disctrack.track.dots.template import Edge, NoiseModel
 from disctrack.track.follow.following import Follower, Tables
-from disctrack.track.refine.assembly import Taken, TrackingSettings, assemble
+from disctrack.track.refine.assembly import Taken, assemble
 from disctrack.trajectory import FrameStatus, MarkerStatus
 from tests.oracles import newton_euler
 from tests.oracles.drawn_boards import corner_view
@@ -174,7 +174,7 @@ def tracked(px, R, t, times, rig, frame_rate):
     # no image is looked at
     follower = Follower(rig, MA_2014, None, (Edge(noise=NoiseModel(0.64, 0.02)),) * 2, measured=True)
     taken = Taken(range(len(px)), frame_rate, G, times)
-    return assemble([follower], tables_of(px, R, t, DOT_PX), TrackingSettings(), taken, 1)
+    return assemble([follower], tables_of(px, R, t, DOT_PX), taken, 1)
 
 
 def errors_and_variances(trajectory, R, t):

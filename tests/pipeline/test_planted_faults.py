@@ -17,8 +17,8 @@ from disctrack.errors import TrackingError
 from disctrack.findings import Kind, in_doubt, leading
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
-from disctrack.track.follow.tracking import TrackingSettings
 from disctrack.track.judge.disc_not_seen import arrangement_found, moved_camera, unlike_declared
+from disctrack.track.refine.assembly import TrackingSettings
 from disctrack.track.refine.scatter import MIN_FRAMES
 from disctrack.validate.errors import compare
 from tests.disctrack.recording.readers.written import write_video

@@ -25,7 +25,7 @@ from disctrack.track.judge.cameras import frames_ahead, left_out
 from disctrack.track.judge.disc_not_seen import MEETING_PX, why_not_seen
 from disctrack.track.judge.doubts import MOVED
 from disctrack.track.pose import DotsInFrames, fit_poses
-from disctrack.track.refine.assembly import Measurement, Taken, TrackingSettings, assemble
+from disctrack.track.refine.assembly import Measurement, Taken, assemble
 from disctrack.track.side_by_side import evenly, stretches
 from disctrack.trajectory import FrameStatus, MarkerStatus
 
@@ -56,7 +56,6 @@ def track(
     taken: Taken,
     rig: StereoRig,
     disc: Disc,
-    settings: TrackingSettings | None = None,
     workers: int = 1,
     progress: Callable[[int], object] = lambda n: None,
 ) -> Measurement:
@@ -67,7 +66,7 @@ def track(
     to the last bit. progress(n) is called when n more pairs are done, from any thread but one at a time.
     Raises TrackingError if the images do not belong to the rig or if the disc is found in no pair.
     """
-    settings, pairs = settings or TrackingSettings(), taken.pairs
+    pairs = taken.pairs
     _check_dots(disc)
     read_blocks, stuck = _as_one_sensor(read_blocks, pairs)
     begin = Follower(rig, disc, maps_of(rig))
@@ -80,7 +79,7 @@ def track(
             raise _not_found(followers, pairs, why_not_seen(_some(read_blocks, pairs), rig, disc))
         for follower in followers:
             follower.disc = disc
-        return assemble(followers, tables, settings, taken, workers)
+        return assemble(followers, tables, taken, workers)
 
     tracking = measured(disc, progress)
     dropped = _dropped(tracking, read_blocks, pairs, begin)

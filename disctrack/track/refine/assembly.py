@@ -57,12 +57,13 @@ class Measurement(Brief):
 
 @dataclass(frozen=True)
 class Taken:
-    """Which pairs are measured, their times, and gravity."""
+    """Which pairs are measured, their times, gravity, and the options."""
 
     pairs: range
     frame_rate: float  # [Hz]
     gravity: float = 9.81  # [m/s^2]
     stamps: Array | None = None  # [s] of all frames, written by the camera
+    settings: TrackingSettings = TrackingSettings()
 
     @property
     def time(self) -> Array:
@@ -71,9 +72,7 @@ class Taken:
         return frames / self.frame_rate if self.stamps is None else np.asarray(self.stamps[frames], float)
 
 
-def assemble(
-    followers: list[Follower], tables: Tables, settings: TrackingSettings, taken: Taken, workers: int = 1
-) -> Measurement:
+def assemble(followers: list[Follower], tables: Tables, taken: Taken, workers: int = 1) -> Measurement:
     """Trajectory of frames that were followed in one stretch or in several; alters `tables`.
 
     workers : threads; the result does not depend on their number, to the last bit
@@ -84,7 +83,7 @@ def assemble(
     tables.status[repeated & ~repeated.all(axis=1, keepdims=True)] = MarkerStatus.NOT_LOOKED_FOR
     dots, pixels, covariance = dot_centres(tables.results, tables.status)
     seen = DotsInFrames(rig, disc, pixels, covariance, tables.R, tables.t)
-    exposure, of_exposure = _correct_dots(seen, dots, first, settings, taken)
+    exposure, of_exposure = _correct_dots(seen, dots, first, taken)
     as_built, faults, outlying = _shared(seen, workers)
     seen = replace(seen, rig=as_built.rig, disc=as_built.disc)
     fits = fit_all(seen, workers)
@@ -96,7 +95,7 @@ def assemble(
     by_motion, of_motion = camera_motion(seen, fits, taken.pairs)
     systematic += by_motion
     moved = by_pattern(as_built, fits.R_world_body)
-    fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, disc, settings.table, moved)
+    fits, systematic, rig, table = table_from_disc(fits, systematic, as_built.rig, disc, taken.settings.table, moved)
     moved = by_pattern(as_built, fits.R_world_body, off_centre(table, np.arccos(fits.R_world_body[:, 2, 2]), disc))
     systematic += moved @ moved.swapaxes(1, 2)
     # after the table: the excess scatter of the poses may be correlated, and would not average out in its fit
@@ -128,7 +127,7 @@ def assemble(
 
 
 def _correct_dots(
-    seen: DotsInFrames, dots: AnyArray, first: Follower, settings: TrackingSettings, taken: Taken
+    seen: DotsInFrames, dots: AnyArray, first: Follower, taken: Taken
 ) -> tuple[tuple[float, float], tuple[Finding, ...]]:
     """Correct the dots for exposure, glare and lens field; returns the exposure [s] and findings about it.
 
@@ -136,7 +135,7 @@ def _correct_dots(
     """
     where, of = dots_at(seen.R, seen.t, seen.rig, seen.disc), (0.5 * seen.disc.marker_diameter, first.edges)
     found = exposure_by_smear(*where, taken.time, dots["sigma"])
-    exposure, findings = exposure_of(found, settings.exposure, 1 / taken.frame_rate)
+    exposure, findings = exposure_of(found, taken.settings.exposure, 1 / taken.frame_rate)
     seen.pixels[...] -= shift_by_glare(*where, dots["contrast"], *of)
     if any(exposure):
         seen.pixels[...] -= shift_by_exposure(*where, taken.time, np.array(exposure), *of)

@@ -7,9 +7,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from disctrack import FrameStatus, frames, measure_pairs
 from disctrack.findings import Kind, Severity
 from disctrack.track.dots.template import Edge, NoiseModel
-from disctrack.track.follow.tracking import TrackingSettings
 from disctrack.track.pose import dots_at
 from disctrack.track.refine import dot_shifts as smears
+from disctrack.track.refine.assembly import TrackingSettings
 from disctrack.track.refine.dot_shifts import shift_by_exposure, shift_by_glare
 from tests.oracles.flat_dots import covered, locate_in_window
 from tests.rendering import render_disc, rolling_poses
