@@ -1,7 +1,7 @@
 """The complete measurement: a recording's files, or frames in memory, become a trajectory with its provenance."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -26,12 +26,11 @@ from disctrack.recording.readers.blocks import NotRead, PairBlock, check_pair, d
 from disctrack.recording.readers.flat_field import flat_fielded, flat_fields
 from disctrack.recording.readers.same_instants import check_headers, check_same_numbers, check_time_stamps, usable_times
 from disctrack.track.follow.motion_span import MotionSpan, find_motion
-from disctrack.track.follow.tracking import ReadBlocks, check_images, prepare, stretch_edges, track
+from disctrack.track.follow.tracking import Progress, ReadBlocks, check_images, prepare, silent, stretch_edges, track
 from disctrack.track.refine.assembly import Measurement, Taken, TrackingSettings
 from disctrack.trajectory import FrameStatus, at_full_length
 from disctrack.trajectory.file import Provenance
 
-Progress = Callable[[int], None]
 Images = AnyArray  # of any real type; uint8 and uint16 are not copied
 
 WHOLE_BELOW = 2.0  # [s] shorter recordings were cut by the user, and are measured including rest
@@ -120,7 +119,7 @@ def measure(
     pairs: ImagePairs,
     settings: TrackingSettings | None = None,
     threads: Threads | None = None,
-    progress: Progress = lambda n: None,
+    progress: Progress = silent,
     boards: Boards | None = None,
 ) -> Measurement:
     """Track the disc through the pairs; the trajectory has the length of the recording.
@@ -177,7 +176,7 @@ def measure_pairs(
     settings: TrackingSettings | None = None,
     timestamps: Times | None = None,
     threads: Threads = 1,
-    progress: Progress = lambda n: None,
+    progress: Progress = silent,
 ) -> Measurement:
     """Measure the disc's pose in every pair; every frame is measured (no rest is left out).
 

@@ -37,8 +37,8 @@ DECLARED = (Kind.DOTS_MISPLACED, Kind.TABLE_DISAGREES)  # findings about declare
 APART, PAIRED = 10, 60  # frames: contradictory ones in a row that start a test for dropped frames; length of the test
 MAX_EDGE_TURN = np.radians(25.0)  # largest error of the prediction across the edge of two stretches
 
-
 ReadBlocks = Callable[[int, int], Iterable[PairBlock]]  # pairs start ... stop-1, in order
+Progress = Callable[[int], object]  # called with the number of further pairs that are done
 
 
 def prepare(dtype: DTypeLike = np.uint8) -> None:
@@ -51,13 +51,12 @@ def prepare(dtype: DTypeLike = np.uint8) -> None:
     fit_poses(DotsInFrames(rig, MA_2014, *unseen), with_sensitivity=False)
 
 
+def silent(n: int) -> None:
+    """Progress that is not shown."""
+
+
 def track(
-    read_blocks: ReadBlocks,
-    taken: Taken,
-    rig: StereoRig,
-    disc: Disc,
-    workers: int = 1,
-    progress: Callable[[int], object] = lambda n: None,
+    read_blocks: ReadBlocks, taken: Taken, rig: StereoRig, disc: Disc, workers: int = 1, progress: Progress = silent
 ) -> Measurement:
     """Measure the disc's pose in every pair of a recording.
 
@@ -72,7 +71,7 @@ def track(
     begin = Follower(rig, disc, maps_of(rig))
     edges = stretch_edges(pairs, disc)
 
-    def measured(expected: Disc, progress: Callable[[int], object]) -> Measurement:
+    def measured(expected: Disc, progress: Progress) -> Measurement:
         """With the dots expected at the positions of a disc."""
         followers, tables = _followed(read_blocks, edges, replace(begin, disc=expected), workers, progress)
         if not np.isfinite(tables.t).any():
@@ -85,11 +84,11 @@ def track(
     dropped = _dropped(tracking, read_blocks, pairs, begin)
     for finding in dropped:
         read_blocks = _without(read_blocks, frames.CAMERAS.index(finding.subject.camera), finding.subject.frames[0][0])
-        tracking = measured(disc, lambda n: None)
+        tracking = measured(disc, silent)
     found = tracking.trajectory.disc
     off = np.abs(found.marker_centres_body - disc.marker_centres_body).max()
     if off > LOOK_AGAIN and not _faulty(tracking.trajectory.findings):
-        tracking = measured(found, lambda n: None)
+        tracking = measured(found, silent)
     noticed = (*dropped, *tracking.trajectory.findings)
     arranged = why_not_seen(_conflicts(tracking, noticed, read_blocks, pairs), rig, disc)
     return replace(tracking, trajectory=replace(tracking.trajectory, findings=(*arranged, *noticed, *stuck)))
@@ -118,7 +117,7 @@ def _dropped(tracking: Measurement, read_blocks: ReadBlocks, pairs: range, begin
     start = pairs[first]
     edges = [start, min(start + PAIRED, pairs.stop)]
     alone = (_without(read_blocks, other, start) for other in (1, 0))
-    ahead = frames_ahead(*(_followed(one, edges, begin, 1, lambda n: None)[1].R for one in alone))
+    ahead = frames_ahead(*(_followed(one, edges, begin, 1, silent)[1].R for one in alone))
     return (left_out(ahead, pairs, first),) if ahead else ()
 
 
@@ -160,11 +159,7 @@ def _not_found(followers: list[Follower], pairs: range, why: tuple[Finding, ...]
 
 
 def _followed(
-    read_blocks: ReadBlocks,
-    edges: list[int],
-    begin: Follower,
-    workers: int,
-    progress: Callable[[int], object],
+    read_blocks: ReadBlocks, edges: list[int], begin: Follower, workers: int, progress: Progress
 ) -> tuple[list[Follower], Tables]:
     """Follow the disc through the stretches between the edges; other arguments as for `track`."""
     first = edges[0]
@@ -172,7 +167,7 @@ def _followed(
     followers = [replace(begin, first_row=edge - first) for edge in edges[:-1]]
     given_up, reporting = Event(), Lock()
 
-    def follow(k: int, report: Callable[[int], object]) -> None:
+    def follow(k: int, report: Progress) -> None:
         """Follow the disc through one of the stretches."""
         for block in read_blocks(edges[k], edges[k + 1]):
             if given_up.is_set():
@@ -195,7 +190,7 @@ def _followed(
             stretch = tables.part(slice(start, edges[k + 1] - first))
             for name, empty in vars(empty_tables(1, begin.disc.n_markers)).items():
                 getattr(stretch, name)[...] = empty
-            follow(k, lambda n: None)
+            follow(k, silent)
     return followers, tables
 
 
