@@ -82,8 +82,7 @@ def acquire(pair: Sequence[AnyArray] | AnyArray, rig: StereoRig, disc: Disc, by_
 
     by_one : use the dots of a single camera, too, if both together show too few; that takes four times as long
     """
-    diameters = expected_diameter_px(rig, disc)
-    blobs = [dot_blobs(image, diameter)[:, :2] for image, diameter in zip(pair, diameters, strict=True)]
+    blobs = [dot_blobs(*each)[:, :2] for each in zip(pair, expected_diameter_px(rig, disc), strict=True)]
     return acquire_from_blobs(blobs, rig, disc, by_one)
 
 
@@ -218,13 +217,11 @@ def _candidates_from_one_camera(blobs: Array, camera: int, rig: StereoRig, disc:
     return _best(R[good], t[good], score[good])
 
 
-def _best_explanation(
-    candidates: list[Pose], blobs: list[Array], rig: StereoRig, disc: Disc
-) -> tuple[Pose | None, int]:
-    """Fit the candidates to the blobs they explain; the best pose, or None, and the number of dot images explained."""
-    if not candidates:
+def _best_explanation(poses: list[Pose], blobs: list[Array], rig: StereoRig, disc: Disc) -> tuple[Pose | None, int]:
+    """Fit the poses to the blobs they explain; the best one, or None, and the number of dot images explained."""
+    if not poses:
         return None, 0
-    R, t = (np.array(parts) for parts in zip(*candidates, strict=True))
+    R, t = (np.array(parts) for parts in zip(*poses, strict=True))
     shape = len(R), 2, disc.n_markers
     covariance = np.broadcast_to(BLOB_PX**2 * np.eye(2), (*shape, 2, 2))
     for _ in range(2):  # match with the pose of the triple, then with the refined one
