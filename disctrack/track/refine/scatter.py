@@ -84,17 +84,14 @@ def split_scatter(fits: PoseFits, markers_covariance_px2: Array, by_free_cameras
         noise = min(whole, free)
     noise = max(noise, LEAST_NOISE)
     # three sigmas of chance: both are means over n frames, but overlapping triples have half the information
-    freedom = float(np.sum(fits.degrees_of_freedom[fits.degrees_of_freedom >= 6]))
-    by_chance = SURE * noise * np.sqrt(6.0 / max(freedom, 1.0))
+    freedom = max(float(np.sum(fits.degrees_of_freedom[fits.degrees_of_freedom >= 6])), 1.0)
+    by_chance = SURE * noise * np.sqrt(6.0 / freedom)
     systematic = whole - noise if whole - noise > by_chance else 0.0
-    systematic_px = 0.0, 0.0
-    if systematic:
-        share = systematic / whole * 2 * float(fits.used.sum()) / freedom  # the poses absorb part of the residuals
-        seen = (fits.residuals_px[:, camera][fits.used[:, camera]] for camera in (0, 1))  # empty if it sees no dot
-        # robust: the median square of a normal distribution is 0.455 times the variance
-        left, right = (float(np.sqrt(np.median(one**2) / 0.455 * share)) if one.size else 0.0 for one in seen)
-        systematic_px = left, right
-    return Scatter(max(1.0, whole), free, noise, systematic, systematic_px)
+    share = systematic / max(whole, noise) * 2 * float(fits.used.sum()) / freedom  # the poses absorb part of it
+    seen = (fits.residuals_px[:, camera][fits.used[:, camera]] for camera in (0, 1))  # empty if it sees no dot
+    # robust: the median square of a normal distribution is 0.455 times the variance
+    left, right = (float(np.sqrt(np.median(one**2) / 0.455 * share)) if one.size else 0.0 for one in seen)
+    return Scatter(max(1.0, whole), free, noise, systematic, (left, right))
 
 
 def frame_to_frame_chi_square(fits: PoseFits, markers_covariance_px2: Array) -> float | None:
