@@ -191,18 +191,17 @@ def pattern_size(disc: Disc, shift: Array, covariance: Array) -> tuple[float, fl
 
 def sized_by_pattern(rig: StereoRig, size: float, sigma: float) -> tuple[StereoRig, float]:
     """The rig with its scale corrected by its share of `size` +- `sigma`, and that share; see the module."""
-    by_size = [i for i, a in enumerate(rig.allowances) if a.cause == SIZE and a.shift[PAIR_SHIFT].any()]
-    if not by_size:
+    of_size = next((a for a in rig.allowances if a.cause == SIZE and a.shift[PAIR_SHIFT].any()), None)
+    if of_size is None:
         return rig, 0.0
-    shift = rig.allowances[by_size[0]].shift
+    shift = of_size.shift
     own = float(np.linalg.norm(shift[PAIR_SHIFT])) / rig.baseline
     share = own**2 / (own**2 + sigma**2)
     remaining = np.sqrt(1.0 - share)
-    allowances = list(rig.allowances)
-    allowances[by_size[0]] = replace(allowances[by_size[0]], shift=remaining * shift)
+    allowances = tuple(replace(a, shift=remaining * shift) if a is of_size else a for a in rig.allowances)
     covariance = rig.covariance - (1.0 - remaining**2) * np.outer(shift, shift)
     grown = rig.perturbed(share * size / own * shift)
-    return replace(grown, covariance=covariance, allowances=tuple(allowances)), share
+    return replace(grown, covariance=covariance, allowances=allowances), share
 
 
 def _from_middle(disc: Disc) -> Array:

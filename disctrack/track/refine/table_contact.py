@@ -203,9 +203,7 @@ def _narrowed(
     return replace(rig, covariance=covariance, allowances=allowances), factors(by_disc, of_disc)
 
 
-def _contacts(
-    fits: PoseFits, systematic: Array, disc: Disc, by_pattern: Array
-) -> tuple[Array, Array, Array, Array, Array, Array] | None:
+def _contacts(fits: PoseFits, systematic: Array, disc: Disc, by_pattern: Array) -> tuple[Array, ...] | None:
     """See `TableFromDisc`: plane, middle, d plane / d RIG_PARAMETERS (3, 30), covariance of the plane by noise, its
     changes by one tolerance of radius and thickness (3, 2), and by the pattern's position (3, k).
     """
