@@ -238,9 +238,9 @@ def _tracked(
 ) -> Measurement:
     """Track the disc through the pairs taken."""
     not_read: NotRead = {}  # a dictionary, as some images are read twice
-    workers = 1  # stretches followed in parallel: one per core, if frames can be read in any order
-    if pairs.left.random_access and pairs.right.random_access:
-        workers = max(1, min(threads, len(stretch_edges(taken.pairs, recording.disc)) - 1))
+    # stretches followed in parallel: one per core, if frames can be read in any order
+    stretches = len(stretch_edges(taken.pairs, recording.disc)) - 1
+    workers = min(threads, stretches) if pairs.left.random_access and pairs.right.random_access else 1
     reading = pairs.reading(not_read, max(1, threads // workers))  # each worker has its own three blocks
     try:
         found = track(reading, taken, rig, recording.disc, workers, progress)

@@ -276,6 +276,5 @@ def _saturated(images: Image, fits: AnyArray, noise: NoiseModel) -> int | None:
     """Grey value at which the brighter side of the edges of dots (k,) of DOT is clipped; None if it is not."""
     saturation = saturation_level(images)
     level = float(np.median(fits["level"] * (1.0 - np.minimum(fits["contrast"], 0.0))))
-    if saturation is None or saturation - level >= 3.0 * np.sqrt(noise.variance(np.array(level))):
-        return None
-    return saturation
+    clipped = saturation is not None and saturation - level < 3.0 * np.sqrt(noise.variance(np.array(level)))
+    return saturation if clipped else None

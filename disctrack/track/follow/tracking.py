@@ -76,9 +76,7 @@ def track(
         followers, tables = _followed(read_blocks, edges, replace(begin, disc=expected), workers, progress)
         if not np.isfinite(tables.t).any():
             raise _not_found(followers, pairs, why_not_seen(_some(read_blocks, pairs), rig, disc))
-        for follower in followers:
-            follower.disc = disc
-        return assemble(followers, tables, taken, workers)
+        return assemble([replace(follower, disc=disc) for follower in followers], tables, taken, workers)
 
     tracking = measured(disc, progress)
     dropped = _dropped(tracking, read_blocks, pairs, begin)
