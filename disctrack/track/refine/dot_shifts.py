@@ -121,12 +121,10 @@ def _common(found: Array, longest: float) -> float:
         return 0.0
     weight = sigma[known] ** -2
     mean = float(weight @ value[known] / weight.sum())
-    if not SURE * weight.sum() ** -0.5 < mean < longest**2 * (1 + SURE * APPROXIMATE):
-        return 0.0
+    significant = SURE * weight.sum() ** -0.5 < mean < longest**2 * (1 + SURE * APPROXIMATE)
     doubt = np.hypot(np.hypot(*sigma), APPROXIMATE * mean)
-    if known.all() and abs(value[1] - value[0]) > SURE * doubt:
-        return 0.0
-    return min(float(np.sqrt(mean)), longest)
+    differ = known.all() and abs(value[1] - value[0]) > SURE * doubt
+    return min(float(np.sqrt(mean)), longest) if significant and not differ else 0.0
 
 
 def _in_words(camera: str, squared: float, sigma: float) -> str:
