@@ -10,7 +10,7 @@ computed: Hairer & Wanner, Solving Ordinary Differential Equations II, section I
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import types
@@ -60,13 +60,6 @@ class _Drive(NamedTuple):
     f: Array
     J: Array
     P: Array
-
-
-@owning_part
-def _drive(p, columns, n, knots, pieces):
-    u, u_rate = np.zeros(len(pieces)), np.zeros(len(pieces))
-    piece = np.zeros(1, np.int64)
-    return _Drive(p, columns, knots, pieces, piece, u, u_rate, np.zeros(n), np.zeros((n, n)), np.zeros((n, len(p))))
 
 
 @exact_part
@@ -163,15 +156,14 @@ def _stages(rhs, t, step, z, Z, drive, F, J, P, M, left):
         at = t + _RADAU_C[s] * step
         inputs_at(at, drive.piece[0], drive.knots, drive.pieces, drive.u, drive.u_rate)
         rhs(at, z[:n] + Z[s * n : (s + 1) * n, 0], drive.p, drive.u, drive.u_rate, F[s], J[s], P[s])
+    M[:] = np.eye(3 * n)
+    left[:] = -Z
     for s in range(3):
-        for i in range(n):
-            row = s * n + i
-            left[row, 0] = -Z[row, 0]
-            for r in range(3):
-                left[row, 0] += step * _RADAU_A[s, r] * F[r, i]
-                for j in range(n):
-                    M[row, r * n + j] = -step * _RADAU_A[s, r] * J[r, i, j]
-            M[row, row] += 1.0
+        rows = slice(s * n, (s + 1) * n)
+        for r in range(3):
+            weight = step * _RADAU_A[s, r]
+            left[rows, 0] += weight * F[r]
+            M[rows, r * n : (r + 1) * n] -= weight * J[r]
 
 
 @owning_part
@@ -183,7 +175,6 @@ def _implicit_step(rhs, t, step, z, drive, slope, size, W):
     n, k = len(size), len(drive.columns)
     F, J, P = np.zeros((3, n)), np.zeros((3, n, n)), np.zeros((3, n, len(drive.p)))
     Z, M, change, own = np.zeros((3 * n, 1)), np.zeros((3 * n, 3 * n)), np.zeros((3 * n, 1)), np.zeros((3 * n, k))
-    E, error = np.zeros((n, n)), np.zeros((n, 1))
     for _ in range(_NEWTON):
         _stages(rhs, t, step, z, Z, drive, F, J, P, M, change)
         if not _solve(M, change):
@@ -197,11 +188,8 @@ def _implicit_step(rhs, t, step, z, drive, slope, size, W):
     if not moved < _CLOSE:
         return np.inf
     _stages(rhs, t, step, z, Z, drive, F, J, P, M, change)
+    E, error = _REAL / step * np.eye(n) - drive.J, slope[:n].copy().reshape(n, 1)
     for i in range(n):
-        error[i, 0] = slope[i]
-        for j in range(n):
-            E[i, j] = -drive.J[i, j]
-        E[i, i] += _REAL / step
         for s in range(3):
             error[i, 0] += _RADAU_E[s] * Z[s * n + i, 0] / step
             W[s, i] = Z[s * n + i, 0]
@@ -242,7 +230,9 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
     size : (n,) of the states, to which the tolerance is relative
     """
     N, m = len(z), len(samples)
-    drive = _drive(p, columns, n, knots, pieces)
+    u, u_rate, piece = np.zeros(len(pieces)), np.zeros(len(pieces)), np.zeros(1, np.int64)
+    f, J, P = np.zeros(n), np.zeros((n, n)), np.zeros((n, len(p)))
+    drive = _Drive(p, columns, knots, pieces, piece, u, u_rate, f, J, P)
     made, W, largest = dop853.room(z, N), np.zeros((3, N)), np.zeros(len(columns))
     K, new = made.K, made.end
     t, end = span[0], span[1]
@@ -346,10 +336,7 @@ def evaluate(function, times, states, p, knots, pieces, values, by_state, by_num
 def prepare() -> None:
     """Compile the functions called from Python for these types only, or load them from the cache."""
     whole = types.int64
-    wanted: tuple[tuple[Any, tuple[Any, ...]], ...] = (
-        (integrate, (RHS_TYPE, _v, _v, whole[::1], _v, whole, _v, _cube, _v, _f, whole, _v, _m)),
-        (evaluate, (RHS_TYPE, _v, _m, _v, _v, _cube, _m, _cube, _cube)),
-    )
-    for function, arguments in wanted:
-        function.compile(arguments)
+    integrate.compile((RHS_TYPE, _v, _v, whole[::1], _v, whole, _v, _cube, _v, _f, whole, _v, _m))
+    evaluate.compile((RHS_TYPE, _v, _m, _v, _v, _cube, _m, _cube, _cube))
+    for function in (integrate, evaluate):
         function.disable_compile()
