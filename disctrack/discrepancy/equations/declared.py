@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from calibration.kit.arrays import Array
-from disctrack.discrepancy.equations.expressions import Formula, checked_name, unknown_name
+from disctrack.discrepancy.equations.expressions import Formula, check_known, check_name
 from disctrack.discrepancy.noise import SmoothNoise
 from disctrack.errors import AnalysisError, told_as
 
@@ -87,7 +87,7 @@ class Equations:
         seen: dict[str, str] = {}
         for what, names in groups.items():
             for name in names:
-                checked_name(name, what)
+                check_name(name, what)
                 if name in seen:
                     raise AnalysisError(f"{name!r} is declared twice, as {seen[name]} and as {what}.")
                 seen[name] = what
@@ -95,8 +95,7 @@ class Equations:
             raise AnalysisError("equations need at least one state: rates={'x': '-k*x'}.")
         for pair in self.mass:
             for name in pair:
-                if name not in self.rates:
-                    raise AnalysisError(f"mass {pair}: {unknown_name(name, self.rates)}")
+                check_known(name, self.rates, f"mass {pair}")
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -246,8 +245,7 @@ def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[s
     wanted = {"start": equations.states, "known": equations.states, "constants": equations.constants}
     for what, known in (*wanted.items(), ("inputs", equations.inputs), ("sigma", channels)):
         for key in given if what == "sigma" else getattr(run, what):
-            if key not in known:
-                raise AnalysisError(f"run {name}, {what}: {unknown_name(key, known)}")
+            check_known(key, known, f"run {name}, {what}")
     data, sigma = np.full((2, n, len(channels)), np.nan)  # of sigma: to be found
     for i, c in enumerate(channels):
         if c in run.data:

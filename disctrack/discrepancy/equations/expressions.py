@@ -6,7 +6,6 @@ import keyword
 import math
 import operator
 from collections.abc import Iterable, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -29,23 +28,26 @@ _OPERATIONS: Mapping[type, Any] = {
 }  # fmt: skip
 
 
-def checked_name(name: str, what: str) -> str:
-    """The name, if a formula can use it. Raises AnalysisError."""
+def check_name(name: str, what: str) -> None:
+    """Raise AnalysisError if a formula cannot use the name."""
     if not name.isidentifier() or keyword.iskeyword(name):
         raise AnalysisError(f"{what} {name!r}: a formula cannot use this name. Letters, digits and _ only, as in x_1.")
     if name in _KNOWN or name == "t":
         raise AnalysisError(f"{what} {name!r}: this name has a meaning of its own in formulas. Choose another.")
-    return name
 
 
 def parsed(formula: Formula, symbols: Mapping[str, sympy.Symbol], what: str) -> sympy.Expr:
     """The formula in these symbols. Raises AnalysisError with `what` where it cannot be read or knows another name."""
     if isinstance(formula, str):
         try:
-            found = sympy.sympify(_read(formula, {**_KNOWN, **symbols}))
+            tree = ast.parse(formula.strip(), mode="eval")
+            parts = sum(isinstance(node, ast.expr) for node in ast.walk(tree))
+            if parts > MOST_PARTS:
+                raise ValueError(f"it has {parts} parts, and {MOST_PARTS} are the most")
+            found = sympy.sympify(_value(tree.body, {**_KNOWN, **symbols}))
         except NameError as error:
             raise AnalysisError(
-                f"{what}: {unknown_name(str(error.name), [*symbols, *_KNOWN])} The formula is {formula}."
+                f"{what}: {_unknown_name(str(error.name), [*symbols, *_KNOWN])} The formula is {formula}."
             ) from error
         except Exception as error:
             shown = formula if len(formula) < 200 else f"{formula[:200]} ..."
@@ -57,11 +59,17 @@ def parsed(formula: Formula, symbols: Mapping[str, sympy.Symbol], what: str) -> 
     unknown = sorted(s.name for s in found.free_symbols - set(symbols.values()))
     unknown += sorted(str(f.func) for f in found.atoms(sympy.core.function.AppliedUndef))
     if unknown:
-        raise AnalysisError(f"{what}: {unknown_name(unknown[0], [*symbols, *_KNOWN])} The formula is {formula}.")
+        raise AnalysisError(f"{what}: {_unknown_name(unknown[0], [*symbols, *_KNOWN])} The formula is {formula}.")
     return found
 
 
-def unknown_name(name: str, known: Iterable[str]) -> str:
+def check_known(name: str, known: Iterable[str], where: str) -> None:
+    """Raise AnalysisError if the name is not among the known ones."""
+    if name not in known:
+        raise AnalysisError(f"{where}: {_unknown_name(name, known)}")
+
+
+def _unknown_name(name: str, known: Iterable[str]) -> str:
     """'foo is not known', and the nearest known name."""
     names = list(dict.fromkeys(known))
     near = difflib.get_close_matches(name, names, 1)
@@ -69,17 +77,11 @@ def unknown_name(name: str, known: Iterable[str]) -> str:
     return f"{name!r} is not known; {hint}"
 
 
-def _read(text: str, names: Mapping[str, Any]) -> Any:
-    """Raises NameError, SyntaxError, TypeError, ValueError, RecursionError."""
-    tree = ast.parse(text.strip(), mode="eval")
-    parts = sum(isinstance(node, ast.expr) for node in ast.walk(tree))
-    if parts > MOST_PARTS:
-        raise ValueError(f"it has {parts} parts, and {MOST_PARTS} are the most")
-    return _value(tree.body, names)
-
-
 def _value(node: ast.expr, names: Mapping[str, Any]) -> Any:
-    """Value of a syntax tree; only the syntax that formulas need is ever evaluated."""
+    """Value of a syntax tree; only the syntax that formulas need is ever evaluated.
+
+    Raises NameError, SyntaxError, TypeError, ValueError, RecursionError.
+    """
     match node:
         case ast.Constant(value=bool() | int() | float() as value):
             return sympy.sympify(value)
@@ -118,9 +120,7 @@ def _power(base: Any, exponent: Any) -> Any:
     return base**exponent
 
 
-def smooth(
-    expression: sympy.Expr, widths: dict[sympy.Expr, sympy.Symbol], moving: AbstractSet[sympy.Symbol] = frozenset()
-) -> sympy.Expr:
+def smooth(expression: sympy.Expr, widths: dict[sympy.Expr, sympy.Symbol], moving: set[sympy.Symbol]) -> sympy.Expr:
     """The expression with jumps smoothed: sign(a) -> tanh(a / w), and steps likewise.
 
     A root of a sum of squares of states has no derivative at zero: sqrt(a) -> sqrt(a + w^2).
@@ -140,7 +140,7 @@ def smooth(
     )
 
 
-def _vanishes(squares: sympy.Expr, moving: AbstractSet[sympy.Symbol]) -> bool:
+def _vanishes(squares: sympy.Expr, moving: set[sympy.Symbol]) -> bool:
     """Is it a sum of squares that may all vanish?"""
     return bool(squares.is_nonnegative) and all(term.free_symbols & moving for term in squares.args)
 

@@ -13,7 +13,7 @@ from calibration.kit.arrays import Array
 from calibration.kit.compiled import compiled, function_of, njit
 from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Samples, Term
-from disctrack.discrepancy.equations.expressions import Formula, checked_name, parsed, smooth, source_of, unknown_name
+from disctrack.discrepancy.equations.expressions import Formula, check_known, check_name, parsed, smooth, source_of
 from disctrack.errors import AnalysisError
 
 OWN = "own_"  # prefix of a term's parameters in its formulas, where the equations use the same name
@@ -70,7 +70,7 @@ class Formulas:
         """Add a term's formulas to rates, sensors and clocks; symbols of its parameters have the prefix."""
         here, mine = f"term {term.name}", {name: _symbol(f"{prefix}{name}") for name in term.parameters}
         for name, p in term.parameters.items():
-            checked_name(name, f"parameter of term {term.name}")
+            check_name(name, f"parameter of term {term.name}")
             quantity = f"{term.name}.{name}"
             self.fitted[quantity], self.declared[quantity] = mine[name], _parameter(p)
             self.owner[quantity] = term.name
@@ -82,8 +82,8 @@ class Formulas:
         mine = marked if any(OWN in str(f) for f in written) else mine | marked
         before: dict[str, sympy.Symbol] = {}
         for name, (u, f) in term.delayed.items():
-            checked_name(name, f"late input of term {term.name}")
-            _known(u, self.equations.inputs, f"{here}, delayed {name}")
+            check_name(name, f"late input of term {term.name}")
+            check_known(u, self.equations.inputs, f"{here}, delayed {name}")
             delay = parsed(f, {**self._numbers, **mine}, f"{here}, delay of {u}")
             self.late_inputs.append((list(self.equations.inputs).index(u), delay))
             symbol = _symbol(f"{prefix}late_{name}")
@@ -91,17 +91,17 @@ class Formulas:
             self.input_rates += (_symbol(f"{prefix}late_{name}_rate"),)
             before |= {name: symbol, f"{OWN}{name}": symbol}
         for name, f in term.rates.items():
-            _known(name, self._rates, f"{here}, rates")
+            check_known(name, self._rates, f"{here}, rates")
             self._rates[name] += parsed(f, {**self._words, **mine, **before}, f"{here}, rate of {name}")
         for name, f in term.observed.items():
-            _known(name, self._seen, f"{here}, observed")
+            check_known(name, self._seen, f"{here}, observed")
             names = {**{s.name: s for s in self._shown}, **self._words, **mine}
             self._seen[name] += parsed(f, names, f"{here}, observed {name}").xreplace(self._shown)
         clock = parsed(term.clock, {**self._still, **mine}, f"{here}, clock")
         for c in self._late:
             self._late[c] += clock
         for name, f in term.lag.items():
-            _known(name, self._late, f"{here}, lag")
+            check_known(name, self._late, f"{here}, lag")
             self._late[name] -= parsed(f, {**self._still, **mine}, f"{here}, lag of {name}")
 
     @property
@@ -243,11 +243,6 @@ def _solved(
 
 def _parameter(given: float | Parameter) -> Parameter:
     return given if isinstance(given, Parameter) else Parameter(float(given))
-
-
-def _known(name: str, known: Iterable[str], where: str) -> None:
-    if name not in known:
-        raise AnalysisError(f"{where}: {unknown_name(name, known)}")
 
 
 @lru_cache(maxsize=64)
