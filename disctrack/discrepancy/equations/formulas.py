@@ -60,11 +60,14 @@ class Formulas:
                 raise AnalysisError(f"term {term.name!r}: needs a name of its own, without '.' and '['.")
             self._add(term, f"term{number}_")
         self.late = tuple(self._late.values())
+        self.is_late = any(e != 0 for e in self.late)  # does a term change the instants of the samples?
         self.widths: dict[sympy.Expr, sympy.Symbol] = {}  # of jumps, by their argument
         moving = set(self.states)
         rates = [smooth(e, self.widths, moving) for e in self._rates.values()]
         self.rates = tuple(_solved(list(states), masses, rates))
         self.observed = tuple(smooth(e, self.widths, moving) for e in self._seen.values())
+        # symbols of all entries of p, by name
+        self.numbers = self.fitted | self.constants | {s.name: s for s in self.widths.values()}
 
     def _add(self, term: Term, prefix: str) -> None:
         """Add a term's formulas to rates, sensors and clocks; symbols of its parameters have the prefix."""
@@ -104,16 +107,6 @@ class Formulas:
             check_known(name, self._late, f"{here}, lag")
             self._late[name] -= parsed(f, {**self._still, **mine}, f"{here}, lag of {name}")
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of all entries of p."""
-        return (*self.fitted, *self.constants, *(s.name for s in self.widths.values()))
-
-    @cached_property
-    def numbers(self) -> list[sympy.Symbol]:
-        """Symbols of p."""
-        return [*self.fitted.values(), *self.constants.values(), *self.widths.values()]
-
     @cached_property
     def rhs(self) -> Any:
         """Compiled rates with derivatives (`_ode_kernel.RHS`)."""
@@ -143,7 +136,7 @@ class Formulas:
     def _compiled(self, name: str, formulas: Sequence[sympy.Expr]) -> Any:
         by_state = [[e.diff(y) for y in self.states] for e in formulas]
         by_number = [[self._by_number(e, s) for s in self.fitted.values()] for e in formulas]
-        arrays = {"y_": self.states, "p_": self.numbers, "u_": self.inputs, "u_rates_": self.input_rates}
+        arrays = {"y_": self.states, "p_": [*self.numbers.values()], "u_": self.inputs, "u_rates_": self.input_rates}
         outputs = {"f_": formulas, "J_": by_state, "P_": by_number}
         return _compiled_source(source_of(name, arrays, outputs), name)
 
@@ -163,19 +156,14 @@ class Formulas:
 
     @cached_property
     def _how_late(self) -> Any:
-        return sympy.lambdify((self.numbers,), [late for _, late in self.late_inputs], "numpy")
-
-    @cached_property
-    def is_late(self) -> bool:
-        """True where a term changes the instants of the samples."""
-        return any(e != 0 for e in self.late)
+        return sympy.lambdify(([*self.numbers.values()],), [late for _, late in self.late_inputs], "numpy")
 
     @cached_property
     def lateness(self) -> Any:
         """(t (m,), p) -> true minus recorded instant (w, m) and its derivatives (w, n_fitted, m); NumPy."""
         fitted = list(self.fitted.values())
         flat = [*self.late, *(e.diff(s) for e in self.late for s in fitted)]
-        function = sympy.lambdify((_t, self.numbers), flat, "numpy")
+        function = sympy.lambdify((_t, [*self.numbers.values()]), flat, "numpy")
 
         def evaluate(time: Array, p: Array) -> tuple[Array, Array]:
             w, values = len(self.late), np.array([np.broadcast_to(x, time.shape) for x in function(time, p)], float)
@@ -187,7 +175,8 @@ class Formulas:
         self, expressions: Iterable[sympy.Expr], t: Array, states: Array, p: Array, u: Sequence[Array]
     ) -> list[Array]:
         """Values (m,) of each expression at instants t (m,), in states (m, n), with inputs u."""
-        function = sympy.lambdify((_t, self.states, self.numbers, self.inputs), list(expressions), "numpy")
+        arguments = _t, self.states, [*self.numbers.values()], self.inputs
+        function = sympy.lambdify(arguments, list(expressions), "numpy")
         with np.errstate(all="ignore"):
             return [np.broadcast_to(x, t.shape) for x in function(t, list(states.T), p, u)]
 

@@ -594,7 +594,7 @@ def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Va
     (now, _, by_number), (before, *_) = (
         f.rates_at(s, system.numbers({**values, **changed}, s), times, states) for changed in ({}, declared)
     )
-    own = by_number[:, here, [f.names.index(name) for name in names]]
+    own = by_number[:, here, [[*f.numbers].index(name) for name in names]]
     return (now - before)[:, here] / own[:, 0], own / own[:, :1]  # first that by the constant
 
 

@@ -162,7 +162,7 @@ class EquationSystem(System):
     def names_of(self, s: Samples) -> dict[str, int]:
         """Quantities of a stretch: the index of each in p, or -1 - i for the i-th initial state."""
         if s.name not in self._places:
-            states, numbers = self.formulas.equations.states, self.formulas.names
+            states, numbers = self.formulas.equations.states, self.formulas.numbers
             found = {f"state.{n}[{where}]": -1 - i for i, n in enumerate(states) for where in (s.name, EACH)}
             own = {name: i for i, n in enumerate(numbers) for name in (self._name(n, s), f"{n}[{EACH}]")}
             self._places[s.name] = found | own
