@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -84,69 +85,64 @@ class Answer:
     @property
     def notes(self) -> tuple[str, ...]:
         """Remarks on the data and on what they do not determine."""
-        about = self._nearest_notes() + self._law_notes() + self._departure_notes() + self._whiteness_notes()
-        return (*self.remarks, *about, *self._outlier_notes())
+        about = chain(self._nearest_notes(), self._law_notes(), self._departure_notes(), self._whiteness_notes())
+        return (*self.remarks, *about, *self._odd_run_notes(), *self._outlier_notes())
 
-    def _law_notes(self) -> list[str]:
+    def _law_notes(self) -> Iterator[str]:
         """Alternatives to the learned law, where it is reported; else the law as an alternative."""
         law = self.law
         if law is None:
-            return []
-        notes = []
+            return
         known = " and ".join(c.name for c in law.instead.candidates)
         longer = f"{law.length - law.instead.length:+.3g} in -2 log evidence"
         text = law.text(self.equations.units)
         nearest = self.diagnosis.nearest
         named = law.candidate.name in {*self.found, *(nearest.effects if nearest else ())}
         if not law.is_shorter:
-            notes.append(f"one law describes the data in place of {known} ({longer}): {text}")
+            yield f"one law describes the data in place of {known} ({longer}): {text}"
         elif not named:
-            notes.append(f"one law comes nearer to the data than {known}, but its residuals are not noise: {text}")
+            yield f"one law comes nearer to the data than {known}, but its residuals are not noise: {text}"
         elif known:
-            notes.append(f"of known terms {known} come nearest (the law: {longer})")
+            yield f"of known terms {known} come nearest (the law: {longer})"
         if law.held and named:
-            notes.append(f"without the law these numbers have no meaning: {', '.join(law.held)}")
+            yield f"without the law these numbers have no meaning: {', '.join(law.held)}"
         if law.along.of_time:
-            notes.append("a force that depends on time alone describes any motion, and is never what is missing")
+            yield "a force that depends on time alone describes any motion, and is never what is missing"
         if law.equivalent:
             others = " or ".join(a.title for a in law.equivalent)
-            notes.append(f"these data do not distinguish the law from {others}")
-        return notes
+            yield f"these data do not distinguish the law from {others}"
 
-    def _nearest_notes(self) -> list[str]:
+    def _nearest_notes(self) -> Iterator[str]:
         """Where no term is found: those that gain most, and their residuals."""
         nearest, helpful, d = self.diagnosis.nearest, list[str](), self.diagnosis
         if nearest is None or leaves_most(nearest.fit.excess(d.noise), d.before.excess(d.noise)):
-            return []  # what leaves most of it describes nothing
+            return  # what leaves most of it describes nothing
         for c in nearest.candidates:
             numbers = ((q.part, self.nearest.get(q.name, q.null)) for q in (*c.quantities, *c.shape))
             sizes = ", ".join(f"{name} = {value:.4g}" for name, value in numbers)
             helpful.append(self._law_text(c) or f"{c.title} [{c.name}] ({sizes})")
         left = self._errors(nearest.fit, None)
-        sizes = ", ".join(f"{e.rms:.3g} of {self.before[c].rms:.3g} {self._unit(c)} of {c}" for c, e in left.items())
-        return [f"{' and '.join(helpful)} would help most and still leave {sizes}".replace(" 1 of", " of")]
+        sizes = ", ".join(f"{e.rms:.3g} of {self.before[c].rms:.3g} {self._of(c)}" for c, e in left.items())
+        yield f"{' and '.join(helpful)} would help most and still leave {sizes}"
 
-    def _departure_notes(self) -> list[str]:
+    def _departure_notes(self) -> Iterator[str]:
         """Fitted parameters far from their declared values, as by a wrong sign or unit."""
-        notes, fitted, in_law = [], self.diagnosis.after, self.law.held if self.law else ()
+        fitted, in_law = self.diagnosis.after, self.law.held if self.law else ()
         for q in fitted.quantities:
             value, declared = fitted.values[q.name], q.null if np.isfinite(q.prior_sigma) else q.declared
             if declared is None or q.owner == NAME or q.name in in_law:
                 continue
             text = f"{q.name.removeprefix('state.')} = {value:.4g} where {declared:.4g} was declared"
             if (away := abs(value - declared) / q.prior_sigma) > FAR_OFF:
-                notes.append(f"{text}: {away:.0f} of its sigmas off")
+                yield f"{text}: {away:.0f} of its sigmas off"
             elif declared * value < 0 and abs(value) > FAR_OFF * self.sigmas[q.name]:
-                notes.append(f"{text}: its sign is another; check the signs of the equations")
+                yield f"{text}: its sign is another; check the signs of the equations"
             elif abs(value) > FAR_OFF * abs(declared) > 0 or abs(declared) > FAR_OFF * abs(value) > 0:
-                notes.append(f"{text}: another order of magnitude; check the units")
-        return notes
+                yield f"{text}: another order of magnitude; check the units"
 
     def _law_text(self, c: Candidate) -> str:
         """The course of the learned law, if this is its candidate; else empty."""
-        if self.law is None or c.name != self.law.candidate.name:
-            return ""
-        return self.law.text(self.equations.units)
+        return self.law.text(self.equations.units) if self.law and c.name == self.law.candidate.name else ""
 
     @property
     def nearest(self) -> dict[str, float]:
@@ -154,20 +150,19 @@ class Answer:
         nearest = self.diagnosis.nearest
         return {n: nearest.fit.values[n] for n in nearest.fit.names} if nearest else {}
 
-    def _whiteness_notes(self) -> list[str]:
+    def _whiteness_notes(self) -> Iterator[str]:
         """Residuals that are as small as noise, but not white."""
-        if self.verdict == "unexplained" or not self.whiteness < self.diagnosis.settings.false_alarm:
-            return []
-        return [
-            f"residuals are as small as the noise but autocorrelated (white noise: p = {self.whiteness:.1g}): "
-            "something smaller is missing, too, or the noise changes with time"
-        ]
+        if self.verdict != "unexplained" and self.whiteness < self.diagnosis.settings.false_alarm:
+            yield (
+                f"residuals are as small as the noise but autocorrelated (white noise: p = {self.whiteness:.1g}): "
+                "something smaller is missing, too, or the noise changes with time"
+            )
 
-    def _odd_run_notes(self) -> list[str]:
+    def _odd_run_notes(self) -> Iterator[str]:
         """Runs with much larger residuals than the others."""
         stretches = self.system.stretches
         if any(s.stretch for s in stretches) or self.diagnosis.held_out_before is None:
-            return []
+            return
         residual, _ = self.judged.linearise(self.diagnosis.after.values, [])
         count = np.array([max(float(np.sum(self.judged.weights[rows])), 1.0) for rows in self.system.blocks])
         left = np.array([float(np.sum(residual[rows] ** 2)) for rows in self.system.blocks]) / count
@@ -175,14 +170,13 @@ class Answer:
         by_noise = stats.chi2.isf(self.diagnosis.settings.false_alarm / len(left), count) / count
         odd = np.flatnonzero(left > level * np.maximum(ODD**2, by_noise))
         worst = [f"{stretches[i].name} ({np.sqrt(left[i] / level):.3g} times)" for i in odd[np.argsort(-left[odd])]]
-        if not worst:
-            return []
-        some = ", ".join(worst[:4]) + (", ..." if len(worst) > 4 else "")
-        return [f"residuals are far larger than in the other runs in {some}: look at what was different there"]
+        if worst:
+            some = ", ".join(worst[:4]) + (", ..." if len(worst) > 4 else "")
+            yield f"residuals are far larger than in the other runs in {some}: look at what was different there"
 
-    def _outlier_notes(self) -> list[str]:
-        """Odd runs, and single outliers, which make noise and sigmas too large."""
-        notes, d = self._odd_run_notes(), self.diagnosis
+    def _outlier_notes(self) -> Iterator[str]:
+        """Single outliers, which make noise and sigmas too large."""
+        d = self.diagnosis
         predicted = self.predicted(d.nearest.fit if d.nearest else d.after)
         for c, channel in enumerate(self.system.formulas.channels):
             left = [np.abs(s.data[:, c] - seen[:, c]) for s, seen in predicted]
@@ -191,11 +185,10 @@ class Answer:
             if limit > 0 and 0 < len(off) < FEW * sum(np.isfinite(r).sum() for r in left):
                 some = ", ".join(f"{run} at {t:.4g} s" for run, t in off[:4]) + (", ..." if len(off) > 4 else "")
                 lie = "1 sample lies" if len(off) == 1 else f"{len(off)} samples lie"
-                notes.append(
+                yield (
                     f"{lie} farther off in {channel} than {OUTLIER:.0f} times the scatter of the others ({some}): "
                     "if the sensor erred there, write NaN; if not, more is missing there"
                 )
-        return notes
 
     @property
     def found(self) -> tuple[str, ...]:
@@ -251,10 +244,8 @@ class Answer:
 
     def _checked(self, run: Run) -> Samples:
         (samples,) = checked(self.equations, [run])
-        if run.name:
-            return samples
         first = self.system.stretches[0]
-        return replace(samples, run=first.run, groups=first.groups)
+        return samples if run.name else replace(samples, run=first.run, groups=first.groups)
 
     def _errors(self, fit: Fit, held: Any) -> dict[str, ChannelErrors]:
         names = self.system.formulas.channels
@@ -290,24 +281,19 @@ class Answer:
             loose = [n for n, v in self.values.items() if "." not in n and not self.sigmas[n] < abs(v)]
             open_ = f" {', '.join(loose)} cannot be determined: declare a value or bounds." if loose else ""
             return f"No answer: {d.reason}.{open_} Initial values nearer to the truth may help."
-        level = ", ".join(
-            f"{e.rms:.3g} {self._unit(c)} of {c} (noise {e.noise:.3g})".replace(" 1 of", " of")
-            for c, e in self.after.items()
-        )
+        level = ", ".join(f"{e.rms:.3g} {self._of(c)} (noise {e.noise:.3g})" for c, e in self.after.items())
         if d.verdict == "nothing missing":
             return f"Nothing is missing: the equations leave {level}."
         effects = "; and ".join(self._law_text(f.candidate) or effect_text(f, d) for f in d.found)
         if d.verdict == "found":
             return f"Missing: {effects}. With {'it' if len(d.found) == 1 else 'them'} the equations leave {level}."
         where = f" {self.holds.text(self.equations.units)}" if self.holds else ""
-        if effects:
-            return (
-                f"Something is missing that no term describes; the nearest is {effects}, which leaves {level}.{where}"
-            )
-        return f"Something is missing that no term describes: the equations leave {level}.{where}"
+        nearest = f"; the nearest is {effects}, which leaves" if effects else ": the equations leave"
+        return f"Something is missing that no term describes{nearest} {level}.{where}"
 
-    def _unit(self, name: str) -> str:
-        return self.equations.units.get(name, "1")
+    def _of(self, channel: str) -> str:
+        unit = self.equations.units.get(channel, "1")
+        return f"of {channel}" if unit == "1" else f"{unit} of {channel}"
 
     def __str__(self) -> str:
         """The answer, before and after, and remarks."""
@@ -315,13 +301,12 @@ class Answer:
 
     def report(self, drawn: Sequence[Drawn] = ()) -> Report:
         """The report, for every writer."""
-        equations = [f"d{k}/dt = {v}" for k, v in self.equations.rates.items()]
         return Report(
             f"{self.equations.name}: what is missing?",
             f"Verdict: {self.verdict}. {self.sentence}",
             findings=of_kind(Kind.DIAGNOSIS, Severity.NOTE, (f"{note}." for note in self.notes)),
             blocks=[
-                Section("Equations", [equations]),
+                Section("Equations", [[f"d{k}/dt = {v}" for k, v in self.equations.rates.items()]]),
                 Section("Before and after", [_before_after(self)]),
                 Section("In pictures", [Figures(drawn)]),
                 *tables(self.diagnosis, ("state.", f"{NAME}.")),
@@ -330,17 +315,16 @@ class Answer:
 
     def document(self) -> dict[str, Any]:
         """All of it in JSON's types; the keys are those that `disctrack diagnose` writes."""
-        sides = [{"channels": {c: vars(e) for c, e in errors.items()}} for errors in (self.before, self.after)]
-        found = document(self.diagnosis, self.equations.name, self.sentence, *sides)
-        found |= {
+        sides = [{"channels": errors} for errors in (self.before, self.after)]
+        own = {
             "notes": list(self.notes),
             "equations": {k: str(v) for k, v in self.equations.rates.items()},
             "runs": [{"name": s.name, "samples": len(s.time)} for s in self.system.stretches],
             "whiteness_p_value": self.whiteness,
             "law": None if self.law is None else self.law.document(),
-            "holds": None if self.holds is None else vars(self.holds),
+            "holds": self.holds,
         }
-        return dict(plain(found))
+        return dict(plain(document(self.diagnosis, self.equations.name, self.sentence, *sides) | own))
 
     def write(self, folder: str | Path, overwrite: bool = False) -> tuple[Path, Path]:
         """Write diagnosis.json and diagnosis.html; returns both. Raises OutputError where one is there already."""
