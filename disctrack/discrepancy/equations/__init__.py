@@ -11,21 +11,13 @@
 is disctrack/docs/systems.md.
 """
 
-from disctrack.discrepancy.equations import terms
-from disctrack.discrepancy.equations.answer import Answer, diagnose
-from disctrack.discrepancy.equations.declared import Equations, Parameter, Run, Term
-from disctrack.discrepancy.equations.forecast import Forecast, RunScore
-from disctrack.discrepancy.noise import SmoothNoise
-
-__all__ = [
-    "Answer",
-    "Equations",
-    "Forecast",
-    "Parameter",
-    "Run",
-    "RunScore",
-    "SmoothNoise",
-    "Term",
-    "diagnose",
-    "terms",
-]
+from disctrack.discrepancy.equations import terms as terms
+from disctrack.discrepancy.equations.answer import Answer as Answer
+from disctrack.discrepancy.equations.answer import Forecast as Forecast
+from disctrack.discrepancy.equations.answer import RunScore as RunScore
+from disctrack.discrepancy.equations.declared import Equations as Equations
+from disctrack.discrepancy.equations.declared import Parameter as Parameter
+from disctrack.discrepancy.equations.declared import Run as Run
+from disctrack.discrepancy.equations.declared import Term as Term
+from disctrack.discrepancy.equations.loop import diagnose as diagnose
+from disctrack.discrepancy.noise import SmoothNoise as SmoothNoise

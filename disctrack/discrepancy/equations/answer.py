@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
@@ -13,19 +13,19 @@ import numpy as np
 from scipy import stats
 
 from calibration.kit.arrays import Array
-from calibration.kit.threads import one_blas_thread
 from disctrack.discrepancy.document import document, effect_text, tables
-from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
+from disctrack.discrepancy.elimination import prior_rows
+from disctrack.discrepancy.equations import shooting
+from disctrack.discrepancy.equations.declared import Equations, Run, Samples, checked
 from disctrack.discrepancy.equations.extent import Extent
-from disctrack.discrepancy.equations.forecast import Forecast, RunScore, free_run, scored
 from disctrack.discrepancy.equations.law import NAME, LearnedForce
-from disctrack.discrepancy.equations.loop import find_missing
 from disctrack.discrepancy.equations.system import EquationSystem, fitted_rows
-from disctrack.discrepancy.fit import Fit
+from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.held_out import HeldOut
 from disctrack.discrepancy.noise import OUTLIER, outlier_limit
-from disctrack.discrepancy.search import Diagnosis, Settings, Verdict
+from disctrack.discrepancy.search import Diagnosis, Verdict
 from disctrack.discrepancy.shape import leaves_most
-from disctrack.discrepancy.significance import whiteness
+from disctrack.discrepancy.significance import TWO_SIDED, whiteness
 from disctrack.discrepancy.system import Candidate, System
 from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file, plain
@@ -38,6 +38,7 @@ from disctrack.report.terminal import full
 FEW = 0.02  # share of the samples, above which outliers are the noise
 ODD = 2.0  # rms over the median of all runs, above which one is odd
 FAR_OFF = 10.0  # sigmas, or factor, by which a fitted parameter differs from its declared value
+OF_SIZE = 1e4  # prior sigma of an initial state over its scale: ten times its size
 
 
 @dataclass(frozen=True)
@@ -49,19 +50,26 @@ class ChannelErrors:
     noise: float  # sigma of the noise, estimated from the residuals
 
 
-@one_blas_thread
-def diagnose(
-    equations: Equations, runs: Run | Sequence[Run], terms: Sequence[Term] | None = None, *,
-    settings: Settings | None = None,
-) -> Answer:  # fmt: skip
-    """Fit the equations to the runs and search for what they lack.
+@dataclass(frozen=True)
+class Forecast:
+    """Predicted sensor values at the instants of a run, by channel; NaN where the motion cannot be integrated."""
 
-    runs : they share all parameters, except those declared `per` run or group; each has its own initial state
-    terms : candidates; by default the usual terms (`terms.usual`)
-    settings : extent of the search, and its significance level
-    Raises AnalysisError, which says what was found and what to do.
-    """
-    return Answer(equations, *find_missing(equations, [runs] if isinstance(runs, Run) else list(runs), terms, settings))
+    time: Array  # (n,) [s] since the first sample
+    values: Mapping[str, Array]  # (n,)
+    sigmas: Mapping[str, Array]  # (n,) of a sample: by parameters, initial state, and residuals of the fit
+
+    def __getitem__(self, channel: str) -> Array:
+        """Values of a channel (n,)."""
+        return self.values[channel]
+
+
+@dataclass(frozen=True)
+class RunScore:
+    """How well a free run predicts one channel."""
+
+    rms: float  # of measured minus predicted, in the channel's unit
+    covered: float  # share of the samples within the 95 % band
+    n_samples: int
 
 
 @dataclass(frozen=True)
@@ -239,15 +247,21 @@ class Answer:
 
     def score(self, run: Run, *, window: float = 0.0, by: str = "after") -> dict[str, RunScore]:
         """By channel, how well a free run (`forecast`) predicts the samples of a run after the window."""
-        found = self.forecast(run, window=window, by=by)
-        return scored(found, self._checked(run), self.system.formulas.channels, window)
+        found, samples = self.forecast(run, window=window, by=by), self._checked(run)
+        scores = {}
+        for c, name in enumerate(self.system.formulas.channels):
+            rows = np.isfinite(samples.data[:, c]) & (samples.time > window)
+            left = (samples.data[:, c] - found[name])[rows]
+            within = np.abs(left) <= TWO_SIDED * found.sigmas[name][rows]
+            scores[name] = RunScore(float(np.sqrt(np.mean(left**2))), float(np.mean(within)), int(rows.sum()))
+        return scores
 
     def _checked(self, run: Run) -> Samples:
         (samples,) = checked(self.equations, [run])
         first = self.system.stretches[0]
         return samples if run.name else replace(samples, run=first.run, groups=first.groups)
 
-    def _errors(self, fit: Fit, held: Any) -> dict[str, ChannelErrors]:
+    def _errors(self, fit: Fit, held: HeldOut | None) -> dict[str, ChannelErrors]:
         names = self.system.formulas.channels
         left = np.concatenate([s.data - seen for s, seen in self.predicted(fit)])
         rms = np.sqrt(np.nanmean(left**2, axis=0))
@@ -337,6 +351,50 @@ class Answer:
         write_whole(paths[0], json_file(self.document()))
         write_answer(self, paths[1])
         return paths
+
+
+def free_run(system: EquationSystem, fitted: Fit, samples: Samples, left: Array, window: float) -> Forecast:
+    """Integrate the model with the fitted parameters.
+
+    system : with formulas and sizes; its stretches are not used
+    left : (w,) rms of the residuals of each channel
+    window : [s] of the run to which its initial state is fitted; 0: it starts from the state of the fit or the run
+    """
+    alone = replace(system, stretches=[replace(samples, sigma=np.broadcast_to(left, samples.data.shape))])
+    values, states = dict(fitted.values), [q for q in alone.base if q.is_initial]
+    by_state = [q.name for q in states] if window > 0 else []
+    numbers = [n for n in fitted.shared if n in alone.names_of(samples) and n not in by_state]
+    covariance = fitted.amounts(numbers)[1]
+    spread, follows = np.zeros((0, 0)), np.zeros((0, len(numbers)))
+    if by_state:
+        n = int(np.searchsorted(samples.time, window, side="right"))
+        begin = replace(alone, stretches=[alone.stretches[0].part(0, n)])
+        begun = shooting.initial_guess(begin)[0]
+        loose = [
+            replace(q, null=begun[q.name], prior_sigma=OF_SIZE * q.scale) if np.isinf(q.prior_sigma) else q
+            for q in states
+        ]
+        start = fit(begin, loose, values | begun)
+        values, spread = values | start.values, start.covariance
+        residual, J = begin.linearise(values, [*by_state, *numbers])
+        J = J.reshape(-1, J.shape[-1])
+        # one more step: with a wide band the fit stops before the minimum
+        prior, by_prior = prior_rows(loose, values)
+        step = spread @ (J[:, : len(by_state)].T @ residual.ravel() + by_prior.T @ prior)
+        values |= {name: values[name] + float(d) for name, d in zip(by_state, step, strict=True)}
+        # with other numbers the fit of the initial state is another
+        follows = -spread @ J[:, : len(by_state)].T @ J[:, len(by_state) :]
+    found = alone.predict(values, alone.stretches[0], [*by_state, *numbers])
+    seen = sigma = np.full(samples.data.shape, np.nan)
+    if found is not None:
+        of_start, of_numbers = np.split(found.derivative, [len(by_state)], axis=2)
+        of_numbers = of_numbers + of_start @ follows
+        variance = np.broadcast_to(left**2, seen.shape).copy()
+        for J, C in ((of_start, spread), (of_numbers, covariance)):
+            variance += np.einsum("nwi,ij,nwj->nw", J, C, J)
+        seen, sigma = found.seen, np.sqrt(np.maximum(variance, 0.0))
+    by_channel = [dict(zip(alone.formulas.channels, each.T, strict=True)) for each in (seen, sigma)]
+    return Forecast(samples.time, *by_channel)
 
 
 def _before_after(answer: Answer) -> Listing:

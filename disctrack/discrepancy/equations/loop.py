@@ -7,19 +7,21 @@ import numpy as np
 from scipy.linalg import qr
 
 from calibration.kit.arrays import Array
+from calibration.kit.threads import one_blas_thread
 from disctrack.discrepancy import noise
 from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations import terms as library
+from disctrack.discrepancy.equations.answer import Answer
 from disctrack.discrepancy.equations.declared import Equations, Run, Samples, Term, checked
-from disctrack.discrepancy.equations.extent import Extent, extent
+from disctrack.discrepancy.equations.extent import extent
 from disctrack.discrepancy.equations.formulas import Formulas
-from disctrack.discrepancy.equations.law import LearnedForce, learn, with_law
+from disctrack.discrepancy.equations.law import learn, with_law
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit, fit, no_fit
 from disctrack.discrepancy.score import Linearisation
 from disctrack.discrepancy.search import WIDTH, Diagnosis, Former, Settings, explain
 from disctrack.discrepancy.significance import wald
-from disctrack.discrepancy.system import USED_UP, Candidate, System, Values
+from disctrack.discrepancy.system import USED_UP, Candidate, Values
 from disctrack.errors import AnalysisError
 
 JUMP = 1e-3  # width of a jump over the rms of its argument: an error of 1e-6 of the work of a friction
@@ -35,17 +37,20 @@ STANDS = 8  # equal extreme samples, above which a sensor may be at its limit
 USUAL_SHARE = 0.1  # of the rms of an equation: the typical size of a term
 
 
-def find_missing(
-    equations: Equations, runs: Sequence[Run], terms: Sequence[Term] | None = None, settings: Settings | None = None
-) -> tuple[Diagnosis, EquationSystem, System, bool, tuple[str, ...], LearnedForce | None, Extent | None]:
+@one_blas_thread
+def diagnose(
+    equations: Equations, runs: Run | Sequence[Run], terms: Sequence[Term] | None = None, *,
+    settings: Settings | None = None,
+) -> Answer:  # fmt: skip
     """Fit the equations to the runs and search for what they lack.
 
-    terms : None: the usual ones (`terms.usual`)
-    returns : diagnosis, system in the stretches that were fitted, the same with its noise as estimated, whether that is
-        autocorrelated, remarks, a learned law where one describes the data, and of a single run that is unexplained the
-        parts in which the equations hold
+    runs : they share all parameters, except those declared `per` run or group; each has its own initial state
+    terms : candidates; by default the usual terms (`terms.usual`)
+    settings : extent of the search, and its significance level
+    Raises AnalysisError, which says what was found and what to do.
     """
     settings = settings or Settings(unexplained_share=NEARLY)
+    runs = [runs] if isinstance(runs, Run) else list(runs)
     given = checked(equations, runs)
     if all(fitted_rows(s).all() for s in given):
         raise AnalysisError("no run keeps samples back to judge the fit: give one of them a smaller fit_until.")
@@ -84,7 +89,7 @@ def find_missing(
     if system.held:
         held = ", ".join(system.held)
         notes.append(f"{held} cannot be distinguished from other numbers by these data: held as declared")
-    return diagnosis, system, judged, autocorrelated, tuple(notes), law, holds
+    return Answer(equations, diagnosis, system, judged, autocorrelated, tuple(notes), law, holds)
 
 
 def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationSystem, Diagnosis, list[str]]:
