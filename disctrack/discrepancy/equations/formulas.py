@@ -30,7 +30,7 @@ class Formulas:
 
     def __init__(self, equations: Equations, terms: Sequence[Term], channels: Mapping[str, Formula]) -> None:
         """Read and check every formula. Raises AnalysisError."""
-        self.equations, self.terms, self.channels = equations, tuple(terms), tuple(channels)
+        self.equations, self.terms, self.channels = equations, tuple(terms), channels
         states, inputs = _symbols(equations.rates), _symbols(equations.inputs)
         input_rates = _symbols(f"{name}_rate" for name in equations.inputs)
         self.constants, own = _symbols(equations.constants), _symbols(equations.parameters)

@@ -23,7 +23,6 @@ from calibration.kit.arrays import Array
 from disctrack.discrepancy import search
 from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Samples, Term
-from disctrack.discrepancy.equations.expressions import Formula
 from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, Prediction
 from disctrack.discrepancy.fit import TRIAL, Fit, fit, no_fit
@@ -66,11 +65,6 @@ class Along:
         """In words."""
         of = f"{'time' if self.of_time else self.variable}{', the same in every turn' if self.period else ''}"
         return f"a force on {self.equation} that is a function of {of}"
-
-    @property
-    def basis(self) -> str:
-        """Initials of its basis functions."""
-        return "ab" if self.period else "asj" if self.jumps else "as"
 
     @property
     def variable(self) -> str:
@@ -221,13 +215,10 @@ class LearnedForce(search.Explanation):
         return f"{self.along.title} [{NAME}{held}]: {formula or '; '.join(points)}"
 
 
-def learn(
-    system: EquationSystem, diagnosis: search.Diagnosis, channels: Mapping[str, Formula], judged: System | None = None
-) -> LearnedForce | None:
+def learn(system: EquationSystem, diagnosis: search.Diagnosis, judged: System) -> LearnedForce | None:
     """The law of the largest evidence; together with a known term, or of two variables, where that is needed.
 
-    channels : formulas of what is observed, without terms
-    judged : the system with its noise as estimated, if that is not white
+    judged : the system with its noise as estimated
     Where no law leaves noise, the law nearest to the data, together with known terms. None where no law explains most
     of the excess chi-square, where one known term explains it, or where there are too many runs.
     """
@@ -236,12 +227,12 @@ def learn(
     if len(system.stretches) * len(system.formulas.states) > MOST_STATES:  # too many initial states to fit
         return None
     begin = diagnosis.before.values
-    one, law, reportable = _Competition(1, _knowing(system, channels, 1, begin), diagnosis, judged), None, False
+    one, law, reportable = _Competition(1, _knowing(system, 1, begin), diagnosis, judged), None, False
     several = diagnosis.verdict == "unexplained" or len(diagnosis.found) > 2
     for variables, with_known in ((1, False), (1, True), (2, False))[: 3 if several else 1]:
         if law is not None and reportable and law.at_noise:
             break
-        over = one if variables == 1 else _Competition(2, _knowing(system, channels, 2, begin), diagnosis, judged)
+        over = one if variables == 1 else _Competition(2, _knowing(system, 2, begin), diagnosis, judged)
         for known in [(c,) for c in over.known_terms()] if with_known else [()]:
             trial = over.best(known) if system.budget.open() else None
             if trial is not None and (law is None or trial.length < law.length):
@@ -249,7 +240,7 @@ def learn(
     return law if reportable else _nearest(one.system, diagnosis, judged)
 
 
-def _nearest(system: EquationSystem, diagnosis: search.Diagnosis, judged: System | None) -> LearnedForce | None:
+def _nearest(system: EquationSystem, diagnosis: search.Diagnosis, judged: System) -> LearnedForce | None:
     """The law that improves the best known terms, with their residuals taken for noise; it is no finding.
 
     With good sensors no model of a real system leaves noise. None where known terms do not come near the data.
@@ -259,7 +250,7 @@ def _nearest(system: EquationSystem, diagnosis: search.Diagnosis, judged: System
     near = known.candidates and d.before.reduced_chi_square > search.FAR * noise
     if d.verdict != "unexplained" or not near:
         return None
-    view = system if judged is None else judged.over(system)
+    view = judged.over(system)
     before = held_out(view, known.fit.quantities, known.fit.values, system.training)
     known = replace(known, length=search.length(view, d.settings, noise, known.fit, known.candidates))
     worse = replace(d, noise=noise, before=known.fit, held_out_before=before, ranked=(known,))
@@ -274,22 +265,15 @@ def _nearest(system: EquationSystem, diagnosis: search.Diagnosis, judged: System
 class _Competition:
     """Comparison of laws with each other and with known terms, by the evidence of the same samples."""
 
-    def __init__(
-        self, variables: int, system: EquationSystem, diagnosis: search.Diagnosis, judged: System | None
-    ) -> None:
-        self.system, self.diagnosis, self.noise, self._judged = system, diagnosis, diagnosis.noise, judged
-        base = diagnosis.before
-        self.begin = dict(base.values)
+    def __init__(self, variables: int, system: EquationSystem, diagnosis: search.Diagnosis, judged: System) -> None:
+        self.system, self.diagnosis, self.noise, self.judged = system, diagnosis, diagnosis.noise, judged
+        self.begin = diagnosis.before.values
         chi_square = float(np.sum(system.linearise(self.begin, [])[0] ** 2))
         self.far = not chi_square < search.FAR * self.noise * max(float(np.sum(system.weights)), 1.0)
         self.laws = tuple(_laws(system, self.begin, variables))
         self.trials_penalty = 2.0 * float(np.log(max(len(self.laws), 1)))
         self.shots = shooting.levels(system) if self.far else [system]
-        self.instead = next((e for e in diagnosis.ranked if e.candidates), search.Explanation((), base))
-
-    def view(self, system: EquationSystem) -> System:
-        """The system with the noise as estimated."""
-        return system if self._judged is None else self._judged.over(system)
+        self.instead = next((e for e in diagnosis.ranked if e.candidates), search.Explanation((), diagnosis.before))
 
     def has_converged(self, fitted: Fit) -> bool:
         """Is the promised gain insignificant? Along directions that only the prior determines, steps never end."""
@@ -339,8 +323,6 @@ class _Competition:
             if np.isfinite(length):
                 scans.append((length, law, quantities))
         scans.sort(key=lambda scan: scan[0])
-        if not scans:
-            return None
         trials: list[LearnedForce] = []
         shortest = min((length for length, law, _ in scans if not law.of_time), default=0.0)
         # where the declared equations do not follow the data, the first order is a rough guide
@@ -368,9 +350,11 @@ class _Competition:
         self, system: EquationSystem, law: Along, known: Sequence[Candidate], values: Values
     ) -> tuple[float, tuple[Quantity, ...]]:
         """First-order -2 log evidence, and the law's quantities with the priors that maximise the evidence."""
-        others, own = self._others(system, known), _amplitudes(system, law)
+        others = self._others(system, known)
+        initials = "ab" if law.period else "asj" if law.jumps else "as"  # of the law's basis functions
+        own = tuple(q for c in system.candidates if c.name == NAME for q in c.quantities if q.part[0] in initials)
         values = {q.name: q.null for q in (*others, *own)} | dict(values)
-        view = self.view(system) if len(system.stretches) == len(self.system.stretches) else system
+        view = self.judged.over(system) if len(system.stretches) == len(self.system.stretches) else system
         linear = Linearisation(view, no_fit(others, values), [_candidate(law, own)])
         columns = linear.columns([q.name for q in own])
         # residuals without the law
@@ -394,10 +378,9 @@ class _Competition:
         # the roughest of the plausible priors: a smooth one would understate the uncertainty between the data
         plausible = [prior for length, prior in found if length < shortest + PLAUSIBLE]
         prior = max(plausible, key=lambda prior: float(prior[np.argmax(waves)])) / root
-        quantities = zip(own, prior.tolist(), strict=True)  # chi-square of the fit is not in units of the noise
-        return shortest + float(right @ right) / self.noise + self.trials_penalty, tuple(
-            replace(q, prior_sigma=sigma, scale=1e-3 * sigma) for q, sigma in quantities
-        )
+        # chi-square of the fit is not in units of the noise
+        own = tuple(replace(q, prior_sigma=s, scale=1e-3 * s) for q, s in zip(own, prior.tolist(), strict=True))
+        return shortest + float(right @ right) / self.noise + self.trials_penalty, own
 
     def _fitted(
         self, law: Along, known: tuple[Candidate, ...], own: tuple[Quantity, ...], values: Values,
@@ -405,32 +388,25 @@ class _Competition:
     ) -> list[LearnedForce]:  # fmt: skip
         """The law fitted over longer and longer stretches; none where it loses the data, or takes too many steps."""
         with suppress(GivenUp), self.system.budget.trial(self.system.trial_work):
-            found = self._fit_over_levels(law, known, own, values, shots)
-            return [] if found is None else [found]
-        return []
-
-    def _fit_over_levels(
-        self, law: Along, known: tuple[Candidate, ...], own: tuple[Quantity, ...], values: Values,
-        shots: Sequence[EquationSystem],
-    ) -> LearnedForce | None:  # fmt: skip
-        first, numbers = _set(shots[0], law, values)
-        now = {q.name: 0.0 for q in own} | dict(values) | numbers
-        for system in shots:
-            there = replace(system, widths=first.widths)
-            others, view = self._others(there, known), self.view(there) if system is shots[-1] else there
+            first, numbers = _set(shots[0], law, values)
+            now = {q.name: 0.0 for q in own} | dict(values) | numbers
+            for system in shots:
+                there = replace(system, widths=first.widths)
+                others, view = self._others(there, known), self.judged.over(there) if system is shots[-1] else there
+                fitted = fit(view, (*others, *own), now, TRIAL)
+                if not fitted.reduced_chi_square < search.FAR * self.noise:  # longer stretches leave more
+                    return []
+                now = fitted.values
+                evident, own = self._evidence(there, law, known, now)
             fitted = fit(view, (*others, *own), now, TRIAL)
-            if not fitted.reduced_chi_square < search.FAR * self.noise:  # longer stretches leave more
-                return None
-            now = dict(fitted.values)
-            evident, own = self._evidence(there, law, known, now)
-        fitted = fit(view, (*others, *own), now, TRIAL)
-        # declared parameters and known terms have their usual penalties; that of the law is part of the evidence
-        penalties = search.length(view, self.diagnosis.settings, self.noise, fitted, known) - fitted.cost / self.noise
-        there = _set(self.system, law, fitted.values)[0]
-        return LearnedForce(
-            (*known, _candidate(law, own)), fitted, length=evident + penalties, along=law, instead=self.instead,
-            at_noise=self.at_noise(view, fitted), noise=self.noise, system=there, judged=self.view(there),
-        )  # fmt: skip
+            # declared parameters and known terms have their usual penalties; that of the law is part of the evidence
+            usual = search.length(view, self.diagnosis.settings, self.noise, fitted, known) - fitted.cost / self.noise
+            there = _set(self.system, law, fitted.values)[0]
+            return [LearnedForce(
+                (*known, _candidate(law, own)), fitted, length=evident + usual, along=law, instead=self.instead,
+                at_noise=self.at_noise(view, fitted), noise=self.noise, system=there, judged=self.judged.over(there),
+            )]  # fmt: skip
+        return []
 
 
 def _laws(system: EquationSystem, values: Values, n: int) -> Iterator[Along]:
@@ -469,11 +445,11 @@ def _forced(equations: Equations) -> list[str]:
     return [s for s, f in equations.rates.items() if str(f).strip() not in equations.rates]
 
 
-def _knowing(system: EquationSystem, channels: Mapping[str, Formula], n: int, values: Values) -> EquationSystem:
+def _knowing(system: EquationSystem, n: int, values: Values) -> EquationSystem:
     """The system with a law of n variables as a further term; constants select its equation and its variables."""
     f = system.formulas
     e = f.equations
-    words = {"sign": "sign"}
+    words = dict[str, str]()
     constants = {f"{NAME}_on_{s}": 0.0 for s in _forced(e)}
     for i in range(n):
         own = f"{NAME}_{i}"
@@ -489,7 +465,7 @@ def _knowing(system: EquationSystem, channels: Mapping[str, Formula], n: int, va
         NAME, {s: f"{NAME}_on_{s}*({course})" for s in _forced(e)},
         parameters=dict.fromkeys(basis, Parameter(0.0)), title="a force that no term names",
     )  # fmt: skip
-    known = Formulas(replace(e, constants={**e.constants, **constants}), (*f.terms, term), channels)
+    known = Formulas(replace(e, constants={**e.constants, **constants}), (*f.terms, term), f.channels)
     widths = {known.widths[a].name: system.widths[w.name] for a, w in f.widths.items() if a in known.widths}
     new = {w.name: 1.0 for w in known.widths.values() if w.name not in widths}
     return replace(system, formulas=known, widths=widths | new)
@@ -515,12 +491,6 @@ def _basis(n: int) -> dict[str, tuple[str, float]]:
 
 def _candidate(law: Along, own: tuple[Quantity, ...]) -> Candidate:
     return Candidate(NAME, NAME, "motion", law.title, "learned from the residuals", own)
-
-
-def _amplitudes(system: EquationSystem, law: Along) -> tuple[Quantity, ...]:
-    """Amplitudes of the law, without priors."""
-    own = (q for c in system.candidates if c.name == NAME for q in c.quantities)
-    return tuple(q for q in own if q.part[0] in law.basis)
 
 
 def _set(system: EquationSystem, law: Along, values: Values) -> tuple[EquationSystem, dict[str, float]]:
@@ -605,8 +575,7 @@ def with_law(diagnosis: search.Diagnosis, law: LearnedForce) -> search.Diagnosis
     alone, which fits any motion, is no finding.
     """
     level = f"{law.fit.reduced_chi_square:.3g} per degree of freedom at a noise of {diagnosis.noise:.3g}"
-    at_first = f"{diagnosis.before.reduced_chi_square:.3g}"
-    reason = f"chi-square stays at {at_first}, with a law that was learned at {level}"
+    reason = f"chi-square stays at {diagnosis.before.reduced_chi_square:.3g}, with a law that was learned at {level}"
     if not law.at_noise:
         return replace(diagnosis, reason=reason, nearest=replace(law, fit=with_autocorrelation(law.system, law.fit)))
     ranked = sorted((*diagnosis.ranked, law), key=lambda e: e.length)

@@ -75,12 +75,11 @@ def diagnose(
         diagnosis = replace(diagnosis, verdict="unexplained", reason=reason)
         notes.append(reason)
     judged, runs_whole = diagnosis.judged or system, replace(system, stretches=whole.stretches)
-    law = learn(system, diagnosis, channels, None if judged is system else judged)
+    law = learn(system, diagnosis, judged)
     named = law is not None and law.is_named(diagnosis)
     notes += on_noise if autocorrelated or not (law and named and law.at_noise) else []
     if law is not None and named:
-        judged = law.system if judged is system else judged.over(law.system)
-        system, diagnosis = law.system, with_law(diagnosis, law)
+        system, judged, diagnosis = law.system, law.judged, with_law(diagnosis, law)
     else:
         notes += diagnosis.remarks
     unexplained_alone = diagnosis.verdict == "unexplained" and len(given) == 1
