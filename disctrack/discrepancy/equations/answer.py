@@ -279,12 +279,9 @@ class Answer:
     def whiteness(self) -> float:
         """Probability of such an autocorrelation in white noise (Ljung-Box, smallest of all channels and stretches)."""
         residual, _ = self.judged.linearise(self.diagnosis.after.values, [])
-        p_values = []
-        for rows, s in zip(self.system.blocks, self.system.stretches, strict=True):
-            for c in range(residual.shape[1]):
-                x = residual[rows, c][np.isfinite(s.data[:, c])]
-                if len(x) > 3:
-                    p_values.append(whiteness(x[:, None], 1.0, {}).p_value)
+        present, channels = self.system.present, range(residual.shape[1])
+        series = (residual[rows, c][present[rows, c]] for rows in self.system.blocks for c in channels)
+        p_values = [whiteness(x[:, None], 1.0, {}).p_value for x in series if len(x) > 3]
         return min(1.0, min(p_values) * len(p_values)) if p_values else float("nan")
 
     @property

@@ -299,20 +299,17 @@ def _prewhiten(system: EquationSystem, diagnosis: Diagnosis, settings: Settings)
     if settings.noise is not None or diagnosis.held_out_before is None:
         return diagnosis, False, []
     residual, _ = system.linearise(diagnosis.after.values, [])
-    present = np.zeros(residual.shape, bool)
-    for rows, s in zip(system.blocks, system.stretches, strict=True):
-        present[rows] = np.isfinite(s.data)
-    coefficients, share = noise.autoregression(residual, present, system.blocks)
+    coefficients, share = noise.autoregression(residual, system.present, system.blocks)
     if not coefficients.any():
         return diagnosis, False, []
-    size = float(np.sqrt(np.sum(residual**2) / max(present.sum(), 1)))
+    size = float(np.sqrt(np.sum(residual**2) / max(system.present.sum(), 1)))
     longest = shooting.longest_stretches(system)
     lasting = noise.correlation_lag(residual, system.blocks) * float(np.median(np.diff(longest[0].time)))
     shortest_period = min(min(shooting.period(s), _decorrelation_period(s)) for s in longest)
     # slow residuals are errors of the model, although an autoregression can predict them
     as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_period
     as_noise &= size <= NO_SENSOR
-    white = noise.prewhitened(system, system.blocks, coefficients, present)
+    white = noise.prewhitened(system, system.blocks, coefficients, system.present)
     base = fit(white, system.base, diagnosis.before.values) if as_noise else None
     if base is None or not base.converged:
         if diagnosis.verdict != "unexplained":

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import numpy as np
 from scipy.interpolate import PPoly
@@ -52,16 +52,16 @@ class EquationSystem(System):
     several_minima = frees_shapes = True  # users may declare any equations
 
     def __post_init__(self) -> None:
-        lengths = [len(s.time) for s in self.stretches]
-        first = np.cumsum([0] + [n + 1 for n in lengths])
-        self.blocks = [slice(int(a), int(a) + n) for a, n in zip(first, lengths, strict=False)]
-        n, self._w = int(first[-1]), len(self.formulas.channels)
-        self.time, self.weights, self.training = np.zeros(n), np.zeros(n), np.zeros(n, bool)
+        first = [0, *accumulate(len(s.time) + 1 for s in self.stretches)]
+        self.blocks = [slice(a, b - 1) for a, b in pairwise(first)]
+        n, self._w = first[-1], len(self.formulas.channels)
+        self.time, self.training, self.present = np.zeros(n), np.zeros(n, bool), np.zeros((n, self._w), bool)
         for rows, s in zip(self.blocks, self.stretches, strict=True):
             elapsed = s.time - s.time[0]
             self.time[rows], self.time[rows.stop] = elapsed, elapsed[-1]
-            self.weights[rows] = np.isfinite(s.data).sum(axis=1)
+            self.present[rows] = np.isfinite(s.data)
             self.training[rows] = fitted_rows(s)
+        self.weights = self.present.sum(axis=1).astype(float)
         self._places: dict[str, dict[str, int]] = {}
         self._steps: dict[str, int] = {}  # by stretch: of the last integration with derivatives
         self._defaults = self.formulas.defaults() | self.widths | dict(self.guesses)
@@ -73,8 +73,7 @@ class EquationSystem(System):
         self.base = tuple(self._base())
         self.candidates = tuple(self._candidate(t) for t in self.formulas.terms if t.name not in self.promoted)
 
-    def _base(self) -> list[Quantity]:
-        found = []
+    def _base(self) -> Iterator[Quantity]:
         several = len(self.stretches) > 1
         for i, s in enumerate(self.stretches):
             for name, size in zip(self.formulas.equations.states, self.sizes, strict=True):
@@ -83,13 +82,11 @@ class EquationSystem(System):
                     unit = self.formulas.equations.units.get(name, "1")
                     q = Quantity(f"state.{name}[{s.name}]", unit, 1e-3 * size, value, prior_sigma=sigma,
                                  meaning="at the first sample")  # fmt: skip
-                    found.append(replace(q, slot=f"state.{name}[{EACH}]", block=i) if several else q)
+                    yield replace(q, slot=f"state.{name}[{EACH}]", block=i) if several else q
         for name, p in self._declared.items():
             term = self.formulas.owner[name]
-            if name in self.held or p.shape or (term and term not in self.promoted):
-                continue
-            found += self._with_slots(name, self._quantities(name)) if several else self._quantities(name)
-        return found
+            if not (name in self.held or p.shape or (term and term not in self.promoted)):
+                yield from self._with_slots(name, self._quantities(name)) if several else self._quantities(name)
 
     def _with_slots(self, name: str, quantities: Sequence[Quantity]) -> list[Quantity]:
         """With a slot for every quantity without bounds that belongs to a single stretch."""
@@ -107,11 +104,10 @@ class EquationSystem(System):
         p = self._declared[name]
         scale = 1e-3 * abs(p.value) or 1e-3 * self.typical.get(name, 1.0)
         typical = p.typical or self.typical.get(name, np.inf)
-        names = list(dict.fromkeys(self._name(name, s) for s in self.stretches))
         declared = None if self.formulas.owner[name] else p.value
         return [
             Quantity(n, p.unit, scale, p.value, p.lower, p.upper, p.sigma, p.meaning, typical, declared=declared)
-            for n in names
+            for n in dict.fromkeys(self._name(name, s) for s in self.stretches)
         ]
 
     def _name(self, name: str, s: Samples) -> str:
@@ -142,7 +138,7 @@ class EquationSystem(System):
             found = self.predict(values, s, names)
             if found is None:
                 return np.full_like(residual, np.nan), np.full_like(derivative, np.nan)
-            present = np.isfinite(s.data)
+            present = self.present[rows]
             if s.noise is not None:
                 for c in range(self._w):
                     here = np.flatnonzero(present[:, c])
