@@ -29,10 +29,10 @@ _ATTEMPTS = 100  # evaluations of a trust-region fit
 _INSTANTS = 24  # at which the sizes of the states are estimated
 
 
-def local_polynomial(s: Samples, channel: int, first: int) -> tuple[float, float] | None:
-    """Value and slope of a channel at sample `first`, from a cubic over the largest window that it fits."""
+def local_polynomial(s: Samples, channel: int, first: int) -> tuple[float, float]:
+    """Value and slope of a channel at sample `first`, from a cubic over the largest window that it fits; or NaN."""
     rows = first + np.flatnonzero(np.isfinite(s.data[first:, channel]))
-    best = None
+    best = np.nan, np.nan
     for m in _WINDOWS:
         if m > len(rows):
             break
@@ -41,7 +41,7 @@ def local_polynomial(s: Samples, channel: int, first: int) -> tuple[float, float
         scale = x[-1] or 1.0
         basis = (x[:, None] / scale) ** np.arange(4)
         coefficients = np.linalg.lstsq(basis / sigma[:, None], y / sigma, rcond=None)[0]
-        if best is not None and np.sum(((y - basis @ coefficients) / sigma) ** 2) > 2.0 * (m - 4) + 6:
+        if m > _WINDOWS[0] and np.sum(((y - basis @ coefficients) / sigma) ** 2) > 2.0 * (m - 4) + 6:
             break
         best = (float(coefficients[0]), float(coefficients[1] / scale))
     return best
@@ -52,23 +52,19 @@ def states_from_data(formulas: Formulas, s: Samples, p: Array, first: int, begin
 
     States that these do not determine stay near `begin`.
     """
-    w = len(formulas.channels)
-    local = [local_polynomial(s, c, first) for c in range(w)]
+    local = np.array([local_polynomial(s, c, first) for c in range(len(formulas.channels))])
     value_size = np.array([(np.std(x[np.isfinite(x)]) if np.isfinite(x).any() else 0.0) or 1.0 for x in s.data.T])
-    slope_size = value_size / max(period(s), 1e-300) * 2 * np.pi
+    sizes = np.stack([value_size, value_size / max(period(s), 1e-300) * 2 * np.pi], axis=1)
 
     def misfit(y: Array, slopes: float) -> Array:
         t, y = np.array([s.time[first]]), y[None]
         h, H_y, _ = formulas.sensors_at(s, p, t, y)
         f = formulas.rates_at(s, p, t, y)[0]
         with np.errstate(all="ignore"):  # a guess may lie outside the domain of a logarithm or a root
-            slope = H_y[0] @ f[0]
-        parts = [1e-4 * (y[0] - begin) / np.maximum(np.abs(begin), 1.0)]
-        for c, known in enumerate(local):
-            if known is not None:
-                parts.append(np.array([h[0, c] - known[0]]) / value_size[c])
-                parts.append(slopes * np.array([slope[c] - known[1]]) / slope_size[c])
-        return np.nan_to_num(np.concatenate(parts), nan=1e6, posinf=1e6, neginf=-1e6)
+            seen = np.stack([h[0], H_y[0] @ f[0]], axis=1)
+            away = np.where(np.isnan(local), 0.0, [1.0, slopes] * (seen - local) / sizes)
+        near = 1e-4 * (y[0] - begin) / np.maximum(np.abs(begin), 1.0)
+        return np.nan_to_num(np.append(near, away), nan=1e6, posinf=1e6, neginf=-1e6)
 
     # values first: slopes may have several solutions, and depend on parameters that are not yet fitted
     for slopes in (0.0, 0.1):
@@ -121,8 +117,8 @@ def initial_guess(system: EquationSystem) -> tuple[dict[str, float], Array]:
         seen.append(first)
         values |= {f"state.{name}[{s.name}]": float(v) for name, v in zip(names, first, strict=True)}
         count = max(2, _INSTANTS // len(system.stretches)) if len(system.stretches) < _INSTANTS else 0
-        for row in usable[np.linspace(0, max(len(usable) - 9, 0), count).astype(int)]:
-            seen.append(states_from_data(f, s, p, int(row), first))
+        rows = usable[np.linspace(0, max(len(usable) - 9, 0), count).astype(int)]
+        seen += [states_from_data(f, s, p, int(row), first) for row in rows]
     sizes = np.quantile(np.abs(seen), 0.9, axis=0)
     floor = 1e-6 * max(float(sizes.max()), 1e-12)
     return values, np.asarray(np.maximum(sizes, floor), float)
@@ -237,9 +233,8 @@ def trust_region(system: System, quantities: Sequence[Quantity], declared: Mappi
     through zero, where nothing moves.
     """
     names = [q.name for q in quantities]
-    null = np.array([q.null for q in quantities])
     lower, upper = (np.array([getattr(q, side) for q in quantities]) for side in ("lower", "upper"))
-    size = np.maximum(np.abs(null), [q.scale for q in quantities])
+    size = np.array([max(abs(q.null), q.scale) for q in quantities])
     start = np.clip([declared.get(name, q.null) for name, q in zip(names, quantities, strict=True)], lower, upper)
 
     def at(x: Array) -> dict[str, float]:
