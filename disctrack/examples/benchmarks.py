@@ -50,9 +50,8 @@ class Benchmark:
 def columns(path: Path) -> Columns:
     """Columns of a file by name, each (n,)."""
     if path.suffix.lower() == ".csv":
-        names = path.read_text().partition("\n")[0].replace('"', "").split(",")
-        table = np.genfromtxt(path, delimiter=",", skip_header=1)
-        return {name: table[:, i] for i, name in enumerate(names) if name}
+        table = np.genfromtxt(path, delimiter=",", names=True, deletechars='"')
+        return {name: table[name] for name in table.dtype.names or ()}
     return {name: np.ravel(values) for name, values in loadmat(path).items() if not name.startswith("_")}
 
 
@@ -123,25 +122,18 @@ def present(folder: Path, benchmark: Benchmark) -> list[Path]:
     return found if len(found) == len(benchmark.files) else []
 
 
-def runs_of(b: Benchmark, files: Sequence[Columns]) -> tuple[list[Run], list[Run]]:
-    """Runs for estimation and for the test."""
+def measured(b: Benchmark, paths: Sequence[Path]) -> tuple[Answer, dict[str, float]]:
+    """The answer, and error [unit] and share within the 95 % band of its tests, with the processor time [s]."""
+    began = process_time()
     (u, *_), (y, *_) = b.equations.inputs, b.equations.observed or b.equations.rates
     train, test = (
         [b.run(time, {y: seen}, inputs={u: given}, name=name) for name, (time, given, seen) in records.items()]
-        for records in b.records(*files)
+        for records in b.records(*map(columns, paths))
     )
-    return [run.thinned(b.every) if b.every > 1 else run for run in train], test
-
-
-def measured(benchmark: Benchmark, paths: Sequence[Path]) -> tuple[Answer, dict[str, float]]:
-    """The answer, and error [unit] and share within the 95 % band of its tests, with the processor time [s]."""
-    began = process_time()
-    train, test = runs_of(benchmark, [columns(path) for path in paths])
-    answer = diagnose(benchmark.equations, train, benchmark.offered)
-    scores = [score for run in test for score in answer.score(run, window=benchmark.window).values()]
-    error = benchmark.scale * float(np.mean([s.rms for s in scores]))
-    covered = float(np.mean([s.covered for s in scores]))
-    return answer, {"error": error, "published": benchmark.published, "covered": covered, "s": process_time() - began}
+    answer = diagnose(b.equations, [run.thinned(b.every) if b.every > 1 else run for run in train], b.offered)
+    scores = [score for run in test for score in answer.score(run, window=b.window).values()]
+    error, covered = b.scale * float(np.mean([s.rms for s in scores])), float(np.mean([s.covered for s in scores]))
+    return answer, {"error": error, "published": b.published, "covered": covered, "s": process_time() - began}
 
 
 def example(folder: Path) -> Outcome:
