@@ -14,7 +14,7 @@ Data: Pfrommer, Halm & Posa, "ContactNets", CoRL 2020: 570 tosses of a cube onto
 at 148 Hz. Lengths of the file are half widths of the cube; here they are metres, by the declared half width.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby, islice, pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -318,14 +318,12 @@ class CubeTosses(System):
         left = self.seen - self.effects @ _amounts(values)
         return left[:, None], self.effects[:, None, [COLUMN[n] for n in names]]
 
-    def residuals(self, values: Values) -> list[Array]:
+    def residuals(self, values: Values) -> Iterator[Array]:
         """Residuals (n, 6) [m] of every flight, with its own motion by least squares."""
-        found = []
         for rows in self._flown:
             effects, seen, own = np.split(rows.reshape(-1, rows.shape[-1]), [len(COLUMN), len(COLUMN) + 1], axis=1)
             left = seen[:, 0] - effects @ _amounts(values)
-            found.append((left - own @ np.linalg.lstsq(own, left, rcond=None)[0]).reshape(-1, 6))
-        return found
+            yield (left - own @ np.linalg.lstsq(own, left, rcond=None)[0]).reshape(-1, 6)
 
     def _whiten(self) -> None:
         parts, training = [], []
@@ -377,18 +375,16 @@ def diagnosed(system: CubeTosses) -> Diagnosis:
     return explain(system, {}, SETTINGS, system.training)
 
 
-def errors(system: CubeTosses, d: Diagnosis) -> list[dict[str, float]]:
+def errors(system: CubeTosses, d: Diagnosis) -> Iterator[dict[str, float]]:
     """Rms residuals [m] of the held-out flights per group of channels: of the base model, and with the effects found.
 
     Their values are fitted to the other flights.
     """
-    found = []
     for values in ({}, d.held_out_after.train.values if d.held_out_after else {}):
         residuals = zip(system.flights, system.residuals(values), strict=True)
         left = [x for flight, x in residuals if _kept_back(flight)]
         square = np.sum(np.concatenate(left) ** 2, axis=0) / sum(len(x) - 2 for x in left)
-        found.append({name: float(np.sqrt(np.mean(square[channels]))) for name, channels in GROUPS.items()})
-    return found
+        yield {name: float(np.sqrt(np.mean(square[channels]))) for name, channels in GROUPS.items()}
 
 
 def example(folder: Path) -> Outcome:
