@@ -104,9 +104,8 @@ class Equations:
 
     def channels(self, run: Run) -> Mapping[str, Formula]:
         """What is observed, by channel."""
-        if self.observed is not None:
-            return self.observed
-        return {name: name for name in run.data if name in self.rates}
+        states = {name: name for name in run.data if name in self.rates}
+        return states if self.observed is None else self.observed
 
 
 @dataclass(frozen=True)
@@ -214,13 +213,13 @@ def checked(equations: Equations, runs: Sequence[Run]) -> list[Samples]:
     names = [run.name or f"run{i + 1}" for i, run in enumerate(runs)]
     if len(set(names)) < len(names):
         raise AnalysisError(f"runs need names of their own; found {', '.join(names)}.")
-    channels = [tuple(equations.channels(run)) for run in runs]
-    if not channels[0]:
+    channels = tuple(equations.channels(runs[0]))
+    if not channels:
         raise AnalysisError(
             f"no channel of run {names[0]} ({', '.join(runs[0].data) or 'none'}) is a state "
             f"({', '.join(equations.states)}): say what is observed with observed={{'channel': 'formula'}}."
         )
-    return [_checked_run(equations, run, name, channels[0]) for run, name in zip(runs, names, strict=True)]
+    return [_checked_run(equations, run, name, channels) for run, name in zip(runs, names, strict=True)]
 
 
 def _checked_run(equations: Equations, run: Run, name: str, channels: Sequence[str]) -> Samples:
@@ -281,12 +280,10 @@ def _inputs(equations: Equations, run: Run, name: str, time: Array) -> tuple[Arr
                 + (f" from {time[0]:g} to {time[-1]:g} s." if len(time) else ".")
             )
     time = time - begin
-    columns = []
     for u in equations.inputs:
         if u not in run.inputs:
             raise AnalysisError(f"run {name}: the input {u!r} is missing. Give it with inputs={{{u!r}: values}}.")
-        columns.append(_column(run.inputs[u], f"run {name}, input {u}", len(time)))
-    values = np.array(columns)
+    values = np.array([_column(run.inputs[u], f"run {name}, input {u}", len(time)) for u in equations.inputs])
     if not np.isfinite(values).all():
         raise AnalysisError(f"run {name}: an input must be known at every sample; fill the gaps first.")
     pieces = np.zeros((len(values), 5, len(time) - 1))

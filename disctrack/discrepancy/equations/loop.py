@@ -82,8 +82,7 @@ def diagnose(
         system, judged, diagnosis = law.system, law.judged, with_law(diagnosis, law)
     else:
         notes += diagnosis.remarks
-    unexplained_alone = diagnosis.verdict == "unexplained" and len(given) == 1
-    holds = extent(runs_whole, diagnosis) if unexplained_alone else None
+    holds = extent(runs_whole, diagnosis) if diagnosis.verdict == "unexplained" and len(given) == 1 else None
     notes += [] if system.budget.open() else [USED_UP]
     if system.held:
         held = ", ".join(system.held)
@@ -349,9 +348,8 @@ def _with_residual_sigmas(system: EquationSystem, diagnosis: Diagnosis) -> Diagn
 
 
 def _failure(system: EquationSystem, values: Mapping[str, float]) -> str:
-    lost = shooting.misfits(system, dict(values)).max()
     what = "is nothing like the data"
-    if not np.isfinite(lost):
+    if not np.isfinite(shooting.misfits(system, dict(values))).all():
         what = "has no value at some instant (the root of a negative number, a division by zero, unlimited growth)"
     elif not np.isfinite(system.linearise(values, [q.name for q in system.base])[1]).all():
         return (

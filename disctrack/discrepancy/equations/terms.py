@@ -277,5 +277,4 @@ def usual(equations: Equations) -> tuple[Term, ...]:
             found.append(sensor_limit(channel, str(formula)))
         if equations.inputs or len(observed) > 1:
             found.append(sensor_lag(channel))
-    found.append(clock_rate())
-    return tuple(found)
+    return (*found, clock_rate())
