@@ -45,6 +45,8 @@ def parsed(formula: Formula, symbols: Mapping[str, sympy.Symbol], what: str) -> 
             if parts > MOST_PARTS:
                 raise ValueError(f"it has {parts} parts, and {MOST_PARTS} are the most")
             found = sympy.sympify(_value(tree.body, {**_KNOWN, **symbols}))
+            if not isinstance(found, sympy.Expr):
+                raise ValueError("it has no number as its value")
         except NameError as error:
             raise AnalysisError(
                 f"{what}: {_unknown_name(str(error.name), [*symbols, *_KNOWN])} The formula is {formula}."
