@@ -184,9 +184,8 @@ def with_shapes(system: System, diagnosis: Diagnosis) -> Diagnosis:
         diagnosis = replace(diagnosis, found=everything, after=fitted, remarks=(*diagnosis.remarks, *notes))
     if diagnosis.after is before:
         return diagnosis
-    rows = training_rows(system)
-    held = held_out(system, diagnosis.after.quantities, diagnosis.after.values, rows)
-    return replace(diagnosis, held_out_after=held)
+    after = diagnosis.after
+    return replace(diagnosis, held_out_after=held_out(system, after.quantities, after.values, training_rows(system)))
 
 
 def with_found(diagnosis: Diagnosis, found: Sequence[Found]) -> Diagnosis:
@@ -240,11 +239,10 @@ class _Search:
         self.rows = training_rows(system) if rows is None else rows
         self.candidates = tuple(c for c in system.candidates if not c.sought)
         self.noise = 1.0
-        self.rough = system.several_minima
         self.pool: dict[frozenset[str], Explanation] = {}
         self.expanded: set[frozenset[str]] = set()
         self.scored: dict[frozenset[str], tuple[Linearisation, list[Score]]] = {}
-        self.first: dict[str, tuple[float, Explanation]] = {}  # by effect: its first refit with its gain
+        self.first: dict[str, tuple[float, Fit]] = {}  # by effect: its first refit with its gain
         self.predictions: dict[Fit, HeldOut] = {}
 
     @property
@@ -264,26 +262,12 @@ class _Search:
         if self.system.frees_shapes and first is self.base_model and self._add_free_shapes(best):
             best, alternatives = self._selected()
         after = self.base_model if alternatives is None else best
-        found = tuple(
-            self._found(best, c, r)
-            for c, r in zip(best.candidates, alternatives or (), strict=alternatives is not None)
-        )
+        found = tuple(self._found(best, c, r) for c, r in zip(best.candidates, alternatives or (), strict=False))
         ranked = tuple(replace(e, length=self.length(e)) for e in self._ranked())
-        return Diagnosis(
-            *self._verdict(after, found),
-            found,
-            base,
-            after.fit,
-            self._held_out(base),
-            self._held_out(after.fit),
-            self.noise,
-            self._all_outcomes(scores, found),
-            self.settings,
-            best if alternatives is None else None,
-            ranked,
-            self.length(after),
-            chance=by_chance,
-        )
+        verdict, nearest = self._verdict(after, found), best if alternatives is None else None
+        held, tried = (self._held_out(base), self._held_out(after.fit)), self._all_outcomes(scores, found)
+        answer = Diagnosis(*verdict, found, base, after.fit, *held, self.noise, tried, self.settings)
+        return replace(answer, nearest=nearest, ranked=ranked, length=self.length(after), chance=by_chance)
 
     def _verdict(self, after: Explanation, found: tuple[Found, ...]) -> tuple[Verdict, str]:
         """Verdict and reason."""
@@ -301,8 +285,7 @@ class _Search:
         Far from the data, first-order scores are meaningless: then the shortest of the known explanations is used.
         """
         for names, values in self.former.items():
-            together = tuple(c for c in self.system.candidates if c.name in names)
-            self._explanation(together, values)
+            self._explanation(tuple(c for c in self.system.candidates if c.name in names), values)
         if self.base_model.fit.converged or _near_enough(self.system, self.base_model.fit):
             return self.base_model
         self.expanded.add(frozenset())
@@ -336,27 +319,25 @@ class _Search:
         at_noise, nothing, before = self._at_noise(best.fit), self.base_model, len(self.pool)
         if at_noise and len(best.candidates) < 2:
             return False
+        sought = [c for c in self.system.candidates if c.sought and c.name not in best.names]
         for e in (nothing,) if at_noise or best is nothing else (nothing, best):
             below = e.fit.cost - (1.0 - WORTH_A_SHAPE) * self.noise * e.fit.excess(self.noise)
-            for c in self.system.candidates:
-                wanted = c.shape if e is nothing else c.sought and c.name not in e.names
-                if wanted and self.system.budget.open(kept=FOR_LAWS):
-                    self._with_free_shape(e, c, 0.0, below)
-        faint = [c for c in best.candidates if c.kind == "motion" and at_noise]
-        for rest in (self._refit_without(best, c) for c in faint):
+            wanted = [c for c in self.system.candidates if c.shape] if e is nothing else sought
+            self._add_with_free_shape(e, wanted, 0.0, below)
+        for rest in (self._refit_without(best, c) for c in best.candidates if c.kind == "motion" and at_noise):
             gain = rest.fit.cost - best.fit.cost
-            for c in self.system.candidates:
-                wanted = c.sought and c.name not in best.names and gain <= FAINT * self.noise
-                if wanted and self.system.budget.open(kept=FOR_LAWS):
-                    self._with_free_shape(rest, c, FIRST_ORDER * max(gain, 0.0), best.fit.cost)
+            if gain <= FAINT * self.noise:
+                self._add_with_free_shape(rest, sought, FIRST_ORDER * max(gain, 0.0), best.fit.cost)
         return len(self.pool) > before
 
-    def _with_free_shape(self, e: Explanation, candidate: Candidate, least: float, below: float) -> None:
-        """Add the explanation with one more law, its shape free, if its residuals are noise."""
-        answer = with_free_shape(self.system, e.fit, candidate, least, below)
-        if answer is not None and self._at_noise(answer[1]):
-            new = Explanation((*e.candidates, answer[0]), answer[1])
-            self.pool.setdefault(new.names, new)
+    def _add_with_free_shape(self, e: Explanation, laws: Sequence[Candidate], least: float, below: float) -> None:
+        """Add the explanations with one of these laws more, its shape free, whose residuals are noise."""
+        for law in laws:
+            tried = self.system.budget.open(kept=FOR_LAWS)
+            answer = with_free_shape(self.system, e.fit, law, least, below) if tried else None
+            if answer is not None and self._at_noise(answer[1]):
+                new = Explanation((*e.candidates, answer[0]), answer[1])
+                self.pool.setdefault(new.names, new)
 
     def _noise(self, fit_: Fit) -> float:
         stated = self.settings.noise
@@ -418,7 +399,7 @@ class _Search:
     def _refit(self, e: Explanation, extra: tuple[Candidate, ...]) -> None:
         together = (*e.candidates, *extra)
         names = _names(together)
-        if names in self.pool and not self.rough:
+        if names in self.pool and not self.system.several_minima:
             return
         # the prediction is not smooth in an effect with a threshold, and its refit is slow: only where it is needed
         if any(c.threshold for c in extra) and any(self._removes_most(e, other) for other in self.pool.values()):
@@ -433,7 +414,7 @@ class _Search:
         if names not in self.pool or self.length(new) < self.length(self.pool[names]):
             self.pool[names] = new
         if len(extra) == 1:
-            self.first.setdefault(extra[0].name, (gain, new))
+            self.first.setdefault(extra[0].name, (gain, fitted))
 
     def _explanation(
         self, together: tuple[Candidate, ...], start: Values, tested: Sequence[Candidate] = ()
@@ -449,7 +430,7 @@ class _Search:
     def _has_ended(self, before: Fit, fitted: Fit) -> bool:
         """Converged; or, where chi-square is rough, with little left to gain?"""
         gain = (before.cost - fitted.cost) / self.noise
-        return fitted.converged or (self.rough and fitted.promised < ROUGH * gain)
+        return fitted.converged or (self.system.several_minima and fitted.promised < ROUGH * gain)
 
     def _refit_without(self, e: Explanation, c: Candidate) -> Explanation:
         return self._explanation(*_without(e, c))
@@ -473,8 +454,7 @@ class _Search:
         if self._at_noise(e.fit, best):
             return proposed
         if worth and len(e.candidates) + 2 <= self.settings.max_effects:
-            visible = [s.candidate for s in ranked[:14] if s.visible]
-            pairs = list(combinations(visible, 2))
+            pairs = list(combinations([s.candidate for s in ranked[:14] if s.visible], 2))
             gains = [linear.gain_of(list(dict.fromkeys([*a.names, *b.names])))[0] for a, b in pairs]
             longer = [self._price(pair) - gain / self.noise for pair, gain in zip(pairs, gains, strict=True)]
             proposed += [pairs[i] for i in np.argsort(longer, kind="stable")[:3]]
@@ -653,8 +633,8 @@ class _Search:
         refit_gain, trial = self.first.get(c.name, (None, None))
         gain, held, stuck = first_order if refit_gain is None else refit_gain, None, False
         if trial is not None:
-            stuck = not trial.fit.converged
-            held = self._held_out_gain(self.base_model.fit, trial.fit) if trial.fit in self.predictions else None
+            stuck = not trial.converged
+            held = self._held_out_gain(self.base_model.fit, trial) if trial in self.predictions else None
         same = {r.candidate.name: f.candidate.name for f in found for r in f.cannot_be_told_from}
         if c.name in {f.candidate.name for f in found}:
             reason = "chosen"
