@@ -31,8 +31,10 @@ MANY = (
 
 def verdict_text(answer: TogetherDiagnosis) -> str:
     """The effect missing in all recordings."""
-    d, n, left_out = answer.diagnosis, len(answer.used), [r for r in answer.recordings if r.reason]
-    of_all = f"{n} recordings together" + (f" ({len(left_out)} left out)" if left_out else "")
+    d, left_out = answer.diagnosis, [r for r in answer.recordings if r.reason]
+    of_all = f"{len(answer.recordings) - len(left_out)} recordings together" + (
+        f" ({len(left_out)} left out)" if left_out else ""
+    )
     effects = "; and ".join(effect_text(f, d) for f in d.found)
     if d.held_out_after is None:
         return f"{of_all}: no answer, {d.reason}."

@@ -43,8 +43,7 @@ def diagnose_together(
     settle : also compute which further recording would answer the open questions
     Raises AnalysisError if fewer than two recordings can be used.
     """
-    labels = labels_of(recordings)
-    items = [(recorded, label, model) for recorded, label in zip(recordings, labels, strict=True)]
+    items = [(recorded, label, model) for recorded, label in zip(recordings, labels_of(recordings), strict=True)]
     described = [(recorded.name, label) for recorded, label, _ in items]
     progress(f"{len(items)} recordings, each alone")
     with Crew(DiscMember, items, processes) as crew:
@@ -124,16 +123,10 @@ class DiscMember:
             raise AnalysisError(
                 f"the rolling model cannot be fitted to it alone (chi-square {self.base.reduced_chi_square:.3g})"
             )
-        disc, air = system.disc, {"density of the air": _density(system.trajectory)}
-        return Member(
-            self.name,
-            system.base,
-            system.candidates,
-            self.base.values,
-            int(np.sum(system.weights)),
-            self.labels,
-            covariates=air | {"mass": disc.mass, "radius": disc.radius, "thickness": 2 * disc.half_thickness},
-        )
+        disc, n_data = system.disc, int(np.sum(system.weights))
+        covariates = {"mass": disc.mass, "radius": disc.radius, "thickness": 2 * disc.half_thickness}
+        covariates["density of the air"] = _density(system.trajectory)
+        return Member(self.name, system.base, system.candidates, self.base.values, n_data, self.labels, covariates)
 
     def share(self, own: Sequence[Quantity]) -> None:
         """Declare which quantities of the base are its own; all others are shared."""
@@ -172,18 +165,10 @@ def in_common(members: Sequence[tuple[Mapping[str, str], Systematic, list[Array]
     common: list[Systematic] = []
     for labels, mine, _ in members:
         rigs = [(s, p) for of, s, p in members if of["rig"] == labels["rig"]]
-        discs = [s for of, s, _ in members if of["disc"] == labels["disc"]]
         lens = max((s for s, _ in rigs), key=lambda s: s.lens_px)
         dots = max((s for s, _ in rigs), key=lambda s: s.dot_px)
-        common.append(
-            replace(
-                mine,
-                lens_px=lens.lens_px,
-                lens_length_px=lens.lens_length_px,
-                lens_places=tuple(np.concatenate([p[c] for _, p in rigs]) for c in range(2)),
-                dot_px=dots.dot_px,
-                dot_length_px=dots.dot_length_px,
-                print_m=max(s.print_m for s in discs),
-            )
-        )
+        places = tuple(np.concatenate([p[c] for _, p in rigs]) for c in range(2))
+        print_m = max(s.print_m for of, s, _ in members if of["disc"] == labels["disc"])
+        mine = replace(mine, lens_px=lens.lens_px, lens_length_px=lens.lens_length_px, lens_places=places)
+        common.append(replace(mine, dot_px=dots.dot_px, dot_length_px=dots.dot_length_px, print_m=print_m))
     return common

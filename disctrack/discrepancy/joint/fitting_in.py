@@ -48,32 +48,31 @@ class Blocks:
         if not np.isfinite(every).all():  # an effect without a derivative
             self.candidates, new = [], {}
             residual, every = system.linearise(fit.values, fit.names)
-        derivative, self._by_candidate = every[..., : len(fit.names)], every[..., len(fit.names) :]
-        length = np.sqrt(np.sum(self._by_candidate**2, axis=(0, 1)))
-        self._by_candidate = self._by_candidate / np.where(length > 0, length, 1.0)
+        derivative, by_candidate = every[..., : len(fit.names)], every[..., len(fit.names) :]
+        length = np.sqrt(np.sum(by_candidate**2, axis=(0, 1)))
+        by_candidate = by_candidate / np.where(length > 0, length, 1.0)
         column = {name: i for i, name in enumerate(new)}
         self._columns = [[column[n] for n in c.names] for c in self.candidates]
         free = [i for i, q in enumerate(fit.quantities) if q.lower < fit.values[q.name] < q.upper]
         self.names = tuple(fit.names[i] for i in free)
-        self.right, self.matrix = residual, derivative[..., free]
+        # (n, m, b + c + 1) by the shared quantities, by the sizes of the candidates, and the right side
+        self._rows = np.concatenate([derivative[..., free], by_candidate, residual[..., None]], axis=-1)
         quantities = [fit.quantities[i] for i in free]
-        self.prior = prior_rows(quantities, fit.values)
+        prior, matrix = prior_rows(quantities, fit.values)
+        self._prior = np.column_stack([matrix, np.zeros((len(prior), len(new))), prior])
         self._sigma = np.array([q.prior_sigma for q in quantities])
         self.chi_square = np.sum(residual**2, axis=1)
 
     def others(self, kept: Sequence[int]) -> Iterator[tuple[int, Array]]:
         """Each recording of `kept`, and the compressed rows (m, b + c + 1) of all others and of the priors.
 
-        Columns: shared quantities, sizes of the candidates, right side. By prefix and suffix products, in linear time.
+        By prefix and suffix products, in linear time.
         """
-        c = self._by_candidate.shape[-1]
-        rows = [np.concatenate([self.matrix[k], self._by_candidate[k], self.right[k][:, None]], axis=1) for k in kept]
-        prior = np.concatenate([self.prior[1], np.zeros((len(self.prior[0]), c)), self.prior[0][:, None]], axis=1)
-        before, after = [triangle(prior)], [np.zeros((0, prior.shape[1]))]
-        for block in rows[:-1]:
-            before.append(triangle(np.concatenate([before[-1], block])))
-        for block in rows[:0:-1]:
-            after.append(triangle(np.concatenate([after[-1], block])))
+        before, after = [triangle(self._prior)], [np.zeros((0, self._prior.shape[1]))]
+        for k in kept[:-1]:
+            before.append(triangle(np.concatenate([before[-1], self._rows[k]])))
+        for k in kept[:0:-1]:
+            after.append(triangle(np.concatenate([after[-1], self._rows[k]])))
         for i, *rest in zip(kept, before, reversed(after), strict=True):
             yield i, np.concatenate(rest)
 
@@ -84,17 +83,16 @@ class Blocks:
         others. Combinations of errors of cameras and dots that it determines no better than the calibration are left
         out: their derivatives are mostly noise of its poses.
         """
-        rest = others[:, -1], others[:, : len(self.names)]
-        length = np.linalg.norm(self.matrix[i], axis=0)
+        theirs, mine = others[:, : len(self.names)], self._rows[i][:, : len(self.names)]
+        length = np.linalg.norm(mine, axis=0)
         # a quantity without a prior is left out only where the recording does not show it
         free = 1.0 / INVISIBLE / np.where(length > 0, length, 1.0)
         scale = np.where(np.isfinite(self._sigma), self._sigma, free)
-        U, singular, _ = np.linalg.svd(self.matrix[i] * scale, full_matrices=False)
+        U, singular, _ = np.linalg.svd(mine * scale, full_matrices=False)
         U = U[:, singular > 1.0]
-        mine = U.T @ self.right[i], U.T @ self.matrix[i]
-        together = np.concatenate([rest[0], mine[0]]), np.concatenate([rest[1], mine[1]])
-        least, rank = _least(*rest)
-        both, rank_of_both = _least(*together)
+        least, rank = _least(others[:, -1], theirs)
+        right = np.concatenate([others[:, -1], U.T @ self._rows[i][:, -1]])
+        both, rank_of_both = _least(right, np.concatenate([theirs, U.T @ mine]))
         statistic, degrees = max(both - least, 0.0), U.shape[1] - (rank_of_both - rank)
         p = float(stats.chi2.sf(statistic, degrees)) if degrees > 0 else 1.0
         return ConsistencyTest(statistic, max(degrees, 0), p, float(self.chi_square[i]))
@@ -104,10 +102,9 @@ class Blocks:
 
         All shared quantities are free; under the null hypothesis the candidate has one size in all recordings.
         """
-        c, b = self._by_candidate.shape[-1], len(self.names)
-        theirs = np.concatenate([others[:, :-1], np.zeros((len(others), c)), others[:, -1:]], axis=1)
-        own = self._by_candidate[i]
-        mine = np.concatenate([self.matrix[i], 0 * own, own, self.right[i][:, None]], axis=1)
+        b, c = len(self.names), others.shape[1] - len(self.names) - 1
+        theirs = np.insert(others, [-1] * c, 0.0, axis=1)
+        mine = np.insert(self._rows[i], [b] * c, 0.0, axis=1)
         left = triangle(np.concatenate([theirs, mine]))[b:, b:]  # shared quantities eliminated
         return [self._difference(left, columns, c) for columns in self._columns]
 

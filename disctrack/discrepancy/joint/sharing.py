@@ -114,25 +114,21 @@ class Sharing:
     def _variants(self, having: Mapping[int, Candidate]) -> list[Candidate]:
         """The candidate with one amount for all groups, or with an amount for each, or both."""
         first = next(iter(having.values()))
-        groups = {self.group(self.members[i], q) for i, c in having.items() for q in c.quantities[:1]}
-        variants = []
+        groups = {self.group(self.members[i], c.quantities[0]) for i, c in having.items()}
+        each, variants = [(i, q) for i, c in having.items() for q in c.quantities], []
         is_law = any(k in LAWS for q in first.quantities for k in q.belongs_to)
         one_for_all = len(groups) == 1 or (is_law and first.kind == "motion")
         if one_for_all:
-            for i, c in having.items():
-                for q in c.quantities:
-                    self._share(i, q, "")
-            quantities = tuple(replace(q, linear=False) for q in first.quantities)
+            quantities = [self._share(i, q, "") for i, q in each][: len(first.quantities)]
             title = first.title + (", one value for all" if len(groups) > 1 else "")
-            variants.append(replace(first, quantities=quantities, title=title))
+            variants.append(replace(first, quantities=tuple(quantities), title=title))
         if len(groups) > 1:
             new: dict[str, Quantity] = {}
-            for i, c in having.items():
-                for q in c.quantities:
-                    group = self.group(self.members[i], q)
-                    shared = self._share(i, q, group)
-                    new[shared.name] = shared
-                    self._groups.setdefault(q.name, {})[group] = shared.name
+            for i, q in each:
+                group = self.group(self.members[i], q)
+                shared = self._share(i, q, group)
+                new[shared.name] = shared
+                self._groups.setdefault(q.name, {})[group] = shared.name
             name = f"{first.name} ({EACH})" if one_for_all else first.name
             title = f"{first.title}, with a value for each group" if one_for_all else first.title
             variants.append(replace(first, name=name, quantities=tuple(new.values()), title=title))
@@ -231,7 +227,6 @@ class JointSystem(System):
         width = max([1, *(len(right) for right, _ in reduced.values())])
         residual, derivative = np.full((n, width), np.nan), np.zeros((n, width, len(names)))
         for i, (right, matrix) in reduced.items():
-            residual[i] = 0.0
-            residual[i, : len(right)] = right
+            residual[i] = np.pad(right, (0, width - len(right)))
             derivative[i, : len(right)] = sharing.placed(i, matrix, names)
         return residual, derivative

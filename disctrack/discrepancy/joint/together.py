@@ -20,7 +20,7 @@ from disctrack.discrepancy.joint.crew import Crew
 from disctrack.discrepancy.joint.fitting_in import Blocks, ConsistencyTest, inconsistent
 from disctrack.discrepancy.joint.sharing import EACH, JointSystem, Member, Sharing
 from disctrack.discrepancy.score import Linearisation, score_all, sigmas, span
-from disctrack.discrepancy.search import Diagnosis, Settings, explain
+from disctrack.discrepancy.search import Diagnosis, Found, Settings, explain
 from disctrack.discrepancy.significance import FALSE_ALARM, TWO_SIDED
 from disctrack.discrepancy.system import Candidate
 from disctrack.errors import AnalysisError, DiscTrackError
@@ -74,11 +74,6 @@ class TogetherDiagnosis:
     unusable: tuple[str, ...] = ()  # recordings that could not be read or fitted
     plan: Any = None  # proposed further recordings, if any
 
-    @property
-    def used(self) -> tuple[str, ...]:
-        """Names of the recordings that were used."""
-        return tuple(m.name for m in self.system.sharing.members)
-
 
 def answer_together(
     crew: Crew,
@@ -104,60 +99,51 @@ def answer_together(
     kept = [i for i in range(n) if i not in reasons]
     crew.keep(kept)
     refitted = crew.call("with_common", [(s,) for s in in_common([summaries[i] for i in kept])])
-    reasons |= {i: str(m) for i, m in zip(kept, refitted, strict=True) if isinstance(m, DiscTrackError)}
-    members: list[Member] = [m for m in refitted if not isinstance(m, DiscTrackError)]
-    kept = [i for i in kept if i not in reasons]
+    members: dict[int, Member] = dict(zip(kept, refitted, strict=True))
+    reasons |= {i: str(m) for i, m in members.items() if isinstance(m, DiscTrackError)}
     unusable = (*(names[i] for i in reasons), *unread)
     while True:
+        kept = [i for i in kept if i not in reasons]
         if len(kept) < 2:
             left_out = {names[i]: reason for i, reason in reasons.items()} | dict(unread)
             said = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:5])
             raise AnalysisError(f"fewer than two recordings can be diagnosed together. {said}")
         crew.keep(kept)
-        system, diagnosis = _search(members, crew, settings, progress)
-        most = len(members) - (2 * n + 2) // 3
+        system = JointSystem(Sharing([members[i] for i in kept]), crew)
+        progress(f"{len(kept)} recordings together: {len(system.base)} shared quantities")
+        diagnosis = _searched(system, settings)
+        most = len(kept) - (2 * n + 2) // 3
         effects = [c for c in system.candidates if not c.name.endswith(f"({EACH})")]
         out = inconsistent(system, diagnosis.after, settings.false_alarm, most, effects)
         if not out:
             break
         for k, effect in out.items():
             reasons[kept[k]] = "does not fit the others" + (f"; it differs most by: {effect}" if effect else "")
-        members = [m for k, m in enumerate(members) if k not in out]
-        kept = [i for k, i in enumerate(kept) if k not in out]
     progress("each recording against the others")
     diagnosis, alone = _with_autocorrelation(system, diagnosis, crew)
     blocks = Blocks(system, diagnosis.after)
     judged = {kept[k]: (blocks.consistency(k, others), alone[k]) for k, others in blocks.others(range(len(kept)))}
-    by_recording = (
-        *(
-            OfRecording(name, dict(labels), reasons.get(i, ""), *judged.get(i, ()))
-            for i, (name, labels) in enumerate(described)
-        ),
-        *(OfRecording(name, {}, reason) for name, reason in unread.items()),
-    )
+    recordings = [
+        OfRecording(name, dict(labels), reasons.get(i, ""), *judged.get(i, ()))
+        for i, (name, labels) in enumerate(described)
+    ]
+    recordings += [OfRecording(name, {}, reason) for name, reason in unread.items()]
     laws = _bounds(system, diagnosis), _dependences(system, diagnosis)
-    return TogetherDiagnosis(diagnosis, system, by_recording, *laws, _notes(by_recording, unusable), unusable)
+    return TogetherDiagnosis(diagnosis, system, tuple(recordings), *laws, _notes(recordings, unusable), unusable)
 
 
-def _search(
-    members: Sequence[Member], crew: Crew, settings: Settings, progress: Callable[[str], None]
-) -> tuple[JointSystem, Diagnosis]:
-    sharing = Sharing(members)
-    system = JointSystem(sharing, crew)
-    progress(f"{len(members)} recordings together: {len(system.base)} shared quantities")
-    n = len(members)
+def _searched(system: JointSystem, settings: Settings) -> Diagnosis:
+    """The answer without alternatives that generalise the effect found: a value for each group in place of one for all.
+
+    Every third recording is held out.
+    """
+    n = len(system.time)
     training = np.arange(n) % TEST_EVERY != TEST_EVERY - 1 if n >= TEST_EVERY else np.arange(n) == 0
-    return system, _without_variants(explain(system, sharing.start(), settings, training))
-
-
-def _without_variants(diagnosis: Diagnosis) -> Diagnosis:
-    """Without alternatives that generalise the effect found: a value for each group in place of one for all."""
-    found = [
-        replace(f, cannot_be_told_from=tuple(
-            r for r in f.cannot_be_told_from if r.candidate.name != f"{f.candidate.name} ({EACH})"
-        ))
-        for f in diagnosis.found
-    ]  # fmt: skip
+    diagnosis = explain(system, system.sharing.start(), settings, training)
+    found = list[Found]()
+    for f in diagnosis.found:
+        others = (r for r in f.cannot_be_told_from if r.candidate.name != f"{f.candidate.name} ({EACH})")
+        found.append(replace(f, cannot_be_told_from=tuple(others)))
     return replace(diagnosis, found=tuple(found))
 
 
@@ -165,9 +151,8 @@ def _with_autocorrelation(system: JointSystem, diagnosis: Diagnosis, crew: Crew)
     """With sigmas that allow for autocorrelated residuals; and the fit of each recording alone."""
     after, sharing = diagnosis.after, system.sharing
     extra = [n for f in diagnosis.found for n in f.candidate.names]
-    requested = [
-        (sharing.local_values(i, after.values), sharing.local_names(i, extra)) for i in range(len(sharing.members))
-    ]
+    numbers = range(len(sharing.members))
+    requested = [(sharing.local_values(i, after.values), sharing.local_names(i, extra)) for i in numbers]
     alone = [None if isinstance(a, DiscTrackError) else a for a in crew.call("alone", requested)]
     fitted = [(i, *fits) for i, fits in enumerate(alone) if fits is not None and fits[0].converged]
     growth = np.ones(len(after.quantities))
@@ -228,7 +213,7 @@ def _dependences(system: JointSystem, diagnosis: Diagnosis) -> tuple[Dependence,
     found = []
     for local, groups in sharing.all_groups().items():
         names = [n for n in groups.values() if n in after.names and after.sigma(n) > 0]
-        if len(names) < 2 or len(names) < len(groups):
+        if len(names) < len(groups):
             continue
         values, covariance = np.array([after.values[n] for n in names]), after.amounts(names)[1]
         q = after.quantities[after.names.index(names[0])]
