@@ -61,8 +61,8 @@ class Proposal:
         if self.theta_deg is not None:
             start = f"start at {self.theta_deg:g} deg with omega_3 = {self.omega3:g} rad/s"
         changes = [f"film {self.duration:.2g} s"] if self.duration is not None else []
-        factors = {name: getattr(self, name) for name in CHANGES}
-        changes += [CHANGES[name][0].format(factor) for name, factor in factors.items() if factor != 1.0]
+        factors = ((words, getattr(self, name)) for name, (words, _) in CHANGES.items())
+        changes += [words.format(factor) for words, factor in factors if factor != 1.0]
         return f"{start}, {', '.join(changes)}" if changes else f"{start}, the same again"
 
 
@@ -98,21 +98,14 @@ class Planner:
     """Information of recordings, and with that of a further one, which is one more member of their joint system."""
 
     def __init__(
-        self,
-        members: Sequence[Member],
-        like: int,
-        found: Iterable[str],
-        tested: Iterable[str],
-        questions: Sequence[Question],
-        noise: float = 1.0,
+        self, members: Sequence[Member], like: int, found: Iterable[str], tested: Iterable[str], noise: float = 1.0
     ) -> None:
         """Like : which of the members has the surface, the cameras and, unless it is another, the disc of further ones.
 
         found, tested : names of candidates that are fitted in any case, and of those that are in question
-        questions : that `answer` is called with, of candidates of this member
         noise : variance of the dots over that stated
         """
-        self.questions, self._noise, self._number = tuple(questions), noise, len(members)
+        self._noise, self._number = noise, len(members)
         further = replace(members[like], labels={**members[like].labels, "recording": "further"})
         another = replace(further, labels={**further.labels, "disc": "another"})
         self.sharing = Sharing([*members, further, another])
@@ -123,8 +116,7 @@ class Planner:
         self._priors = np.diag([1.0 / q.prior_sigma for q in quantities.values()])
         # of a sum of shared quantities the first one is kept
         self._column = {local: self._names.index(shared) for shared, local in parts if shared in quantities}
-        here = self._column.values()
-        self._free = [j for j, name in enumerate(self._names) if name in fitted or j not in here]
+        self._free = [j for j, name in enumerate(self._names) if name in fitted or j not in self._column.values()]
         self.now = np.zeros((0, len(self._names)))
 
     def names(self, i: int) -> tuple[str, ...]:
@@ -181,7 +173,7 @@ def planner_alone(system: DiscSystem, fit: Fit, questions: Sequence[Question], n
     candidates = tuple(Candidate(q.name, q.owner, "motion", q.name, "", (q,)) for q in of_one)
     member = Member("", base, candidates, fit.values, 0, {})
     found, new = [n for n in added if n in fit.names], [n for n in added if n not in fit.names]
-    planner = Planner([member], 0, found, new, questions, noise)
+    planner = Planner([member], 0, found, new, noise)
     own = planner.sharing.own(0, base)
     planner.know([Reduction(system, own, fit.values).reduce(fit.values, planner.names(0))])
     return planner
@@ -192,27 +184,21 @@ def planned_recording(proposal: Proposal, system: DiscSystem, values: Values) ->
 
     Raises DiscTrackError if its motion is too short.
     """
-    old = system.trajectory
-    disc = replace(  # of another material, or larger of the same thickness, with larger distances of the dots
-        system.disc,
-        mass=system.disc.mass * proposal.mass * proposal.radius**2,
-        radius=system.disc.radius * proposal.radius,
-        marker_centres_body=system.disc.marker_centres_body * [proposal.radius, proposal.radius, 1.0],
-    )
+    old, disc = system.trajectory, system.disc
+    # of another material, or larger of the same thickness, with larger distances of the dots
+    mass, radius = disc.mass * proposal.mass * proposal.radius**2, disc.radius * proposal.radius
+    centres = disc.marker_centres_body * [proposal.radius, proposal.radius, 1.0]
+    disc = replace(disc, mass=mass, radius=radius, marker_centres_body=centres)
     changed: dict[str, Any] = {"disc": disc, "air_density": old.air_density * proposal.pressure}
     kept = {k: v for k, v in values.items() if not k.startswith(("state.", "rig.", "dot_"))}
     start = state_of(values)
     if proposal.theta_deg is not None:
-        start = steady_precession(
-            np.radians(proposal.theta_deg),
-            disc,
-            system.model.gravity,
-            omega3=proposal.omega3,
-            nutation_amplitude=np.radians(NUTATION_SHARE * proposal.theta_deg),
-        ).moved(**dict(zip("xy", np.nanmean(old.q[:, :2], axis=0).tolist(), strict=True)))
+        theta, swing = np.radians(proposal.theta_deg), np.radians(NUTATION_SHARE * proposal.theta_deg)
+        gravity, (x, y) = system.model.gravity, np.nanmean(old.q[:, :2], axis=0).tolist()
+        steady = steady_precession(theta, disc, gravity, omega3=proposal.omega3, nutation_amplitude=swing)
+        start = steady.moved(x=x, y=y)
     duration, rate = proposal.duration or float(np.ptp(system.time)), old.frame_rate * proposal.rate
-    model = replace(system.model_with(kept), **changed)
-    motion = simulate(model, start, duration, rate=rate, theta_end=MIN_THETA)
+    motion = simulate(replace(system.model_with(kept), **changed), start, duration, rate=rate, theta_end=MIN_THETA)
     n, m = len(motion), disc.n_markers
     if n < MIN_FRAMES:
         raise AnalysisError(f"the motion is over after {n} frames")
@@ -221,28 +207,19 @@ def planned_recording(proposal: Proposal, system: DiscSystem, values: Values) ->
     pixels = np.moveaxis(pixels, -3, 1)
     usual = np.nanmedian(old.markers_covariance_px2.reshape(-1, 2, 2), axis=0) / proposal.numbers
     seen = np.where(np.isfinite(pixels).all(-1), MarkerStatus.MEASURED, MarkerStatus.OUTSIDE)
+    covariance, status = np.broadcast_to(usual, (n, 2, m, 2, 2)), seen.astype(np.uint8)
     # other arrays by frame are not used by the system
-    trajectory = replace(
-        part(old, slice(0, 1)),
-        time=motion.time,
-        q=motion.q,
-        markers_px=pixels,
-        markers_covariance_px2=np.broadcast_to(usual, (n, 2, m, 2, 2)),
-        marker_status=seen.astype(np.uint8),
-        frame_rate=rate,
-        **changed,
-    )
-    known = replace(system.model, **changed)
-    planned = DiscSystem(trajectory, known, rows=slice(0, n), systematic=system.systematic)
+    filmed = replace(part(old, slice(0, 1)), time=motion.time, q=motion.q, frame_rate=rate, **changed)
+    filmed = replace(filmed, markers_px=pixels, markers_covariance_px2=covariance, marker_status=status)
+    planned = DiscSystem(filmed, replace(system.model, **changed), rows=slice(0, n), systematic=system.systematic)
     return planned, kept | {q.name: x for q, x in zip(state_quantities(), start.array[:8].tolist(), strict=True)}
 
 
-def plan(planner: Planner, system: DiscSystem, values: Values) -> Plan:
+def plan(planner: Planner, questions: Sequence[Question], system: DiscSystem, values: Values) -> Plan:
     """Answers of many possible recordings: first other initial conditions, then changes of the best of them.
 
     system, values : of the recording that they are like
     """
-    questions = planner.questions
 
     def answers(rows: Array) -> tuple[float, ...]:
         return tuple(planner.answer(rows, question, values) for question in questions)
@@ -255,14 +232,10 @@ def plan(planner: Planner, system: DiscSystem, values: Values) -> Plan:
                 yield Proposed(proposal, possible[1], answers(possible[0]))
 
     again = Proposal()
-    first = Plan(questions, now, tuple(made((*(Proposal(*start) for start in STARTS), again))))
+    first = Plan(tuple(questions), now, tuple(made((*(Proposal(*start) for start in STARTS), again))))
     bases = dict.fromkeys([again, *(b.proposal for i in range(len(questions)) if (b := first.best(i)) is not None)])
-    changed = (
-        replace(base, **{name: factor})
-        for base in list(bases)[:3]
-        for name, (_, factors) in CHANGES.items()
-        for factor in factors
-    )
+    changes = [{name: factor} for name, (_, factors) in CHANGES.items() for factor in factors]
+    changed = (replace(base, **change) for base, change in product(list(bases)[:3], changes))
     return replace(first, rows=(*first.rows, *made(changed)))
 
 

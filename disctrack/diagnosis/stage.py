@@ -105,7 +105,7 @@ def with_plan(result: DiscDiagnosis) -> DiscDiagnosis:
     scores = score_all(Linearisation(result.system, diagnosis.after, candidates), candidates)
     questions = open_questions(diagnosis, scores)
     planner = planner_alone(result.system, diagnosis.after, questions, diagnosis.noise)
-    return replace(result, plan=plan(planner, result.system, diagnosis.after.values))
+    return replace(result, plan=plan(planner, questions, result.system, diagnosis.after.values))
 
 
 def _verdict_by_residuals(diagnosis: Diagnosis, tests: ResidualTests) -> Diagnosis:

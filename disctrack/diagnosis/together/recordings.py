@@ -9,7 +9,7 @@ from calibration.kit.arrays import Array
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.large_faults import large_faults
 from disctrack.diagnosis.model_file import PAPER, declared_model
-from disctrack.diagnosis.plan import Plan, Planner, open_questions, plan
+from disctrack.diagnosis.plan import Plan, Planner, Question, open_questions, plan
 from disctrack.diagnosis.recorded import Recorded, wrong_declarations
 from disctrack.diagnosis.systematic import MAX_FRAMES, Systematic, find_systematic, noise_over_stated, with_noise
 from disctrack.discrepancy.fit import Fit, fit
@@ -58,17 +58,16 @@ def _plan(answer: TogetherDiagnosis, crew: Crew) -> Plan | None:
     longest = int(np.argmax(system.weights))
     local = {c.name: c for c in sharing.members[longest].candidates}
     asked = open_questions(diagnosis, [b for b in answer.bounds if b.candidate.name in local])
-    questions = [
-        tuple(local[c.name] for c in question) for question in asked if {c.name for c in question} <= local.keys()
-    ]
+    known = (question for question in asked if {c.name for c in question} <= local.keys())
+    questions = [tuple(local[c.name] for c in question) for question in known]
     if not questions:
         return None
     found, tested = [f.candidate.name for f in diagnosis.found], [c.name for question in questions for c in question]
-    planner = Planner(sharing.members, longest, found, tested, questions)
+    planner = Planner(sharing.members, longest, found, tested)
     crew.call("share", [(planner.sharing.own(i, member.base),) for i, member in enumerate(sharing.members)])
     values = [sharing.local_values(i, after.values) for i in range(len(sharing.members))]
     problems = crew.call("reduce", [(at, planner.names(i)) for i, at in enumerate(values)])
-    (further,) = crew.call("planned", [(planner, problems, values[longest])], [longest])
+    (further,) = crew.call("planned", [(planner, questions, problems, values[longest])], [longest])
     return further if isinstance(further, Plan) else None
 
 
@@ -148,10 +147,12 @@ class DiscMember:
         growth = inflation(system, found)
         return found, replace(found, covariance=found.covariance * np.outer(growth, growth))
 
-    def planned(self, planner: Planner, problems: Sequence[Reduced], values: Values) -> Plan:
+    def planned(
+        self, planner: Planner, questions: Sequence[Question], problems: Sequence[Reduced], values: Values
+    ) -> Plan:
         """Further recordings like this one.   problems : of all, for `know`.   values : of its shared quantities"""
         planner.know(problems)
-        return plan(planner, self.system, self._everything(values))
+        return plan(planner, questions, self.system, self._everything(values))
 
     def _everything(self, shared: Values) -> dict[str, float]:
         return {**self.base.values, **self._reduction.own_values, **self.system.known, **shared}
