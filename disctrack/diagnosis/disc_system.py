@@ -14,11 +14,9 @@ from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
 from disctrack.diagnosis import motion
 from disctrack.diagnosis.law_library import LearnedLaw
-from disctrack.diagnosis.missing_force import DiscScan, response
 from disctrack.diagnosis.starts import STRETCHES, shape_guesses, start_values
 from disctrack.diagnosis.stretch import free_stretch
 from disctrack.diagnosis.systematic import DOT_SIGMA, Systematic, field_columns
-from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.held_out import square_root
 from disctrack.discrepancy.system import Budget, Candidate, Quantity, System, Values
 from disctrack.faults.catalogue import faults_of, scene_faults
@@ -188,7 +186,7 @@ class DiscSystem(System):
 
     def start(self) -> dict[str, float]:
         """Initial guess of the base quantities from the measured poses, with the known faults."""
-        return start_values(self, self.known)
+        return start_values(self)
 
     def again(self, candidates: tuple[Candidate, ...] | None = None, **other: Any) -> DiscSystem:
         """A system of the same recording and model, with the same budget; rows, fields and known faults as here.
@@ -200,9 +198,8 @@ class DiscSystem(System):
         system.budget, system.notes = self.budget, self.notes
         return system
 
-    def beginnings(self) -> tuple[DiscSystem, ...]:
+    def beginnings(self) -> Iterator[DiscSystem]:
         """First parts of increasing length, for fits that do not converge for the whole recording."""
-        found = []
         for stretch in STRETCHES:
             n = int(np.searchsorted(self.time, self.time[0] + stretch, side="right"))
             if n < len(self.time):
@@ -210,8 +207,7 @@ class DiscSystem(System):
                 part.rows = slice(self.rows.start, self.rows.start + n)
                 for name in ("time", "used", "observed", "_whiten", "weights", "_nuisance_columns"):
                     setattr(part, name, getattr(self, name)[:n])
-                found.append(part)
-        return tuple(found)
+                yield part
 
     @property
     def per_px(self) -> float:
@@ -222,15 +218,6 @@ class DiscSystem(System):
     def rate(self) -> float:
         """Of the frames [Hz]."""
         return float(1.0 / np.median(np.diff(self.time)))
-
-    def scan(self, fitted: Fit, base: Sequence[Quantity] | None = None) -> DiscScan | None:
-        """First-order gains of laws along the fitted motion; None if the disc slips.
-
-        base : quantities fitted together with a law; by default those of the fit. The contribution of all others is
-            added to the residual to first order: the law is to replace them, along a motion that follows the data.
-        """
-        along = response(self, fitted)
-        return None if along is None else DiscScan(self, fitted, base, along)
 
     def knowing(self, law: LearnedLaw) -> DiscSystem:
         """The same system with this law in its model: its coefficients may be among the values."""
@@ -272,9 +259,8 @@ class DiscSystem(System):
         if moved:
             derivative[..., [column[n] for n in moved]] = self.whitened(sight.by_pose) @ by_motion
         common = [n for n in names if n in self._nuisance_column]
-        if common:
-            mine = self._nuisance_columns[..., [self._nuisance_column[n] for n in common]]
-            derivative[..., [column[n] for n in common]] = mine
+        mine = self._nuisance_columns[..., [self._nuisance_column[n] for n in common]]
+        derivative[..., [column[n] for n in common]] = mine
         for fault in self.faults:
             for name, part in zip(fault.names(), fault.parts, strict=True):
                 if name in column:
@@ -390,8 +376,7 @@ class DiscSystem(System):
     def _sight(self, path: Path, values: Values) -> Sight:
         """The dots in both cameras along this path."""
         q, speed = path[0], path[1].copy()
-        axes = euler_rate_axes_world(q[..., 3], q[..., 4])
-        speed[..., 3:] = (axes @ speed[..., 3:, None])[..., 0]
+        speed[..., 3:] = (euler_rate_axes_world(q[..., 3], q[..., 4]) @ speed[..., 3:, None])[..., 0]
         R, t = rotation_from_euler(q[..., 3], q[..., 4], q[..., 5]), q[..., :3]
         images = predict(R, t, self.rig, self.disc, scene_faults(self.disc, values))
         sight = Sight(self.time, R, t, speed, self.rig, self.disc, values, *images)

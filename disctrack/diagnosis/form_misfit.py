@@ -75,12 +75,7 @@ def moment_about_contact(
 
 
 def with_form(
-    system: DiscSystem,
-    fitted: Fit,
-    law: LearnedLaw,
-    noise: float,
-    correlated: bool = False,
-    companions: Collection[str] = (),
+    system: DiscSystem, fitted: Fit, law: LearnedLaw, noise: float, correlated: bool, companions: Collection[str]
 ) -> tuple[Fit, Fit, Course | None, float]:
     """The fit with covariances averaged over right and wrong form, and with that of a wrong form; and the laws' moment.
 
@@ -226,8 +221,7 @@ def _second_moment(B: Array, right: Array, parts: Sequence[int], sizes: Array = 
             f2[i] = float(weight @ sizes**2 / weight.sum())
     size = np.repeat(np.sqrt(f2), parts)
     scaled = B * size
-    precision = np.eye(len(size)) + scaled.T @ scaled
-    covariance = np.linalg.inv(precision)
+    covariance = np.linalg.inv(np.eye(len(size)) + scaled.T @ scaled)
     mean = covariance @ (scaled.T @ right)
     second = size[:, None] * (covariance + np.outer(mean, mean)) * size
     return second, float(np.sqrt(np.sum(f2)))

@@ -16,7 +16,7 @@ import numpy as np
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import ResidualTests, residual_tests
 from disctrack.diagnosis.law_library import Family, LearnedLaw, differ_from_zero
-from disctrack.diagnosis.missing_force import Gain, law_of
+from disctrack.diagnosis.missing_force import Gain, law_of, scan
 from disctrack.discrepancy.fit import TRIAL, Fit, attempt
 from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, equivalent, length, noise_gain
 from disctrack.discrepancy.shape import leaves_most
@@ -49,15 +49,15 @@ def learn(
     """
     price, law, known = bic_penalty(system.weights), None, system
     current, shortest = base, base.cost / noise
-    scan = system.scan(along, base.quantities) if along is not None else None
-    along = along if scan is not None else None
-    scan = scan or system.scan(base)
-    while scan is not None:
-        library = scan.library()
+    first = scan(system, along, base.quantities) if along is not None else None
+    along = along if first is not None else None
+    scanned = first or scan(system, base)
+    while scanned is not None:
+        library = scanned.library()
         looked = 2.0 * float(np.log(len(library)))
-        worth = [g for g in scan.gains(library) if g.gain / noise > price * g.family.n_numbers + looked]
-        begin, inexact = (base_alone(base, along), along.cost) if along is not None else (current, scan.chi_square)
-        chosen = _worth_a_refit(worth, scan.chi_square, inexact, noise, price, against)
+        worth = [g for g in scanned.gains(library) if g.gain / noise > price * g.family.n_numbers + looked]
+        begin, inexact = (base_alone(base, along), along.cost) if along is not None else (current, scanned.chi_square)
+        chosen = _worth_a_refit(worth, scanned.chi_square, inexact, noise, price, against)
         trials = [_refitted(system, base, law, begin, g, noise) for g in chosen if system.budget.open()]
         lengths = [t.cost / noise + sum(price * f.n_numbers + looked for f in one.families) for one, t in trials]
         if not trials or min(lengths) >= shortest:
@@ -67,12 +67,9 @@ def learn(
         before, (law, current) = current, trials.pop(lengths.index(shortest))
         # how short a law is decides which is named; what the recording determines is what all that fit it agree in
         odds = [(one, _odds(t, current, noise)) for one, t in trials if t.converged]
-        law = replace(
-            law,
-            alike=tuple(title for title in dict.fromkeys(near) if title != law.title),
-            others=tuple((one, share) for one, share in odds if share > UNLIKELY),
-            looked=looked,
-        )
+        alike = tuple(title for title in dict.fromkeys(near) if title != law.title)
+        others = tuple((one, share) for one, share in odds if share > UNLIKELY)
+        law = replace(law, alike=alike, others=others, looked=looked)
         known = system.knowing(law)
         enough = len(law.families) == MAX_TERMS or np.isfinite(against)
         # far from the data, a sum whose terms each remove a small part approximates any motion
@@ -80,7 +77,7 @@ def learn(
         enough |= slow and current.reduced_chi_square > FAR * noise
         if enough or (to_noise and _leaves_noise(known, current, noise)):
             break
-        scan = known.scan(current)
+        scanned = scan(known, current)
     return without_idle_terms(system, law, current) if law is not None else None
 
 
@@ -101,12 +98,12 @@ def shortest_to_first_order(system: DiscSystem, base: Fit, along: Fit, noise: fl
 
     along : fit of known effects, which the law replaces
     """
-    scan = system.scan(along, base.quantities)
-    if scan is None:
+    scanned = scan(system, along, base.quantities)
+    if scanned is None:
         return np.inf
-    library, price = scan.library(), bic_penalty(system.weights)
-    gains = scan.gains(family for family in library if not family.shape)
-    nearest = min((scan.chi_square - g.gain) / noise + price * g.family.n_numbers for g in gains)
+    library, price = scanned.library(), bic_penalty(system.weights)
+    gains = scanned.gains(family for family in library if not family.shape)
+    nearest = min((scanned.chi_square - g.gain) / noise + price * g.family.n_numbers for g in gains)
     return nearest + 2.0 * float(np.log(len(library))) + price * base.n_free
 
 
@@ -137,8 +134,7 @@ def _worth_a_refit(
             kinds.append(g.family.kind)
     if np.isfinite(against):
         # laws that fit as well with more parameters are not named, but contribute to the uncertainty of the force
-        others = (g for g in worth if g.family.kind not in kinds)
-        found += sorted(others, key=lambda g: -g.gain)[:LONGER]
+        found += sorted((g for g in worth if g.family.kind not in kinds), key=lambda g: -g.gain)[:LONGER]
     return found
 
 
@@ -175,9 +171,9 @@ def without_idle_terms(system: DiscSystem, law: LearnedLaw, fitted: Fit) -> Lear
     for family, amounts, shapes in zip(law.families, law.amounts, law.shapes, strict=True):
         busy = busy_amounts(fitted, amounts)
         if busy:
-            title = family.title if 0 in busy else f"{family.title}, without its first term"  # which it is named after
             names = tuple(family.names[i] for i in busy if family.names)
-            title = family.title if names else title
+            # unless its numbers have names, a family is named after its first term
+            title = family.title if names or 0 in busy else f"{family.title}, without its first term"
             kept.append(replace(family, title=title, terms=tuple(family.terms[i] for i in busy), names=names))
             values += [*busy.values(), *(fitted.values[n] for n in shapes)]
     if not kept or len(values) == len(law.candidate.quantities):
@@ -271,9 +267,8 @@ def _subsets(system: DiscSystem, diagnosis: Diagnosis, doubtful: bool) -> tuple[
     or if a law describes the data as well to first order; of several effects, each and all are. Faults of the
     measurement are kept together with the law, unless they become insignificant: no force displaces a dot on the face.
     """
-    of_motion, faults = (
-        tuple(f for f in diagnosis.found if (f.candidate.kind == "motion") == motion) for motion in (True, False)
-    )
+    of_motion = tuple(f for f in diagnosis.found if f.candidate.kind == "motion")
+    faults = tuple(f for f in diagnosis.found if f.candidate.kind != "motion")
     if diagnosis.verdict == "nothing missing" or diagnosis.held_out_before is None:
         return ()
     if diagnosis.verdict != "found":  # the effects found explain most of it, and a law may explain the rest

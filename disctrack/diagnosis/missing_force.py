@@ -4,16 +4,15 @@ The impulse response of the motion (Green's function, `rolling.simulate`) conver
 residual that it would cause, and the measured residual into the moment that is missing from the model.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from calibration.kit.arrays import Array, Indices
 from calibration.kit.least_squares import triangle
+from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.law_library import SHAPES, Family, LearnedLaw, families
 from disctrack.diagnosis.motion import STATE_SCALES, THETA_END, state_of
 from disctrack.discrepancy.elimination import is_linear, prior_rows, projection
@@ -26,9 +25,6 @@ from disctrack.rolling import EffectParameter, Model, Motion
 from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.records import KINEMATICS
 from disctrack.rolling.simulate import COMPONENTS, moved_start, responses
-
-if TYPE_CHECKING:
-    from disctrack.diagnosis.disc_system import DiscSystem
 
 PROBES_PER_TURN = 7  # of the fastest angle, so that a moment locked to it is resolved
 MAX_PROBES = 90
@@ -100,13 +96,13 @@ def missing_moment(blocks: Probed, scale: float | None = None) -> tuple[Course, 
 
 def missing_text(system: DiscSystem, fit_: Fit) -> str:
     """The missing moment in words, and the law that it follows approximately; empty if the disc slips."""
-    blocks, scan = probe(system, fit_), system.scan(fit_)
-    if blocks is None or scan is None:
+    blocks, along = probe(system, fit_), scan(system, fit_)
+    if blocks is None or along is None:
         return ""
     missing, _ = missing_moment(blocks)
-    gains = scan.gains(family for family in scan.library() if not family.shape and family.n_numbers <= 2)
+    gains = along.gains(family for family in along.library() if not family.shape and family.n_numbers <= 2)
     best = max(gains, key=lambda g: g.gain)
-    share = 100 * best.gain / scan.chi_square
+    share = 100 * best.gain / along.chi_square
     return f"missing in the model is {missing.text}; {share:.0f} % of it is described by {best.family.title}"
 
 
@@ -180,7 +176,7 @@ class DiscScan:
     as a shift of that state. Inner products of columns orthogonal to those of the fitted quantities, with orthonormal
     basis W, are the sums over frames of g' (D' D) g minus the products of the sums of W' D g.
 
-    base : as for `DiscSystem.scan`
+    base : as for `scan`
     """
 
     def __init__(self, system: DiscSystem, fit_: Fit, base: Sequence[Quantity] | None, along: Response) -> None:
@@ -253,6 +249,16 @@ class DiscScan:
             gram = before - taken[:, own].T @ taken[:, own]
             found.append(proposal(family, gram, np.diag(before), right[own]))
         return found
+
+
+def scan(system: DiscSystem, fitted: Fit, base: Sequence[Quantity] | None = None) -> DiscScan | None:
+    """First-order gains of laws along the fitted motion; None if the disc slips.
+
+    base : quantities fitted together with a law; by default those of the fit. The contribution of all others is added
+        to the residual to first order: the law is to replace them, along a motion that follows the data.
+    """
+    along = response(system, fitted)
+    return None if along is None else DiscScan(system, fitted, base, along)
 
 
 def law_of(model: Model, chosen: Sequence[Family], values: Array) -> LearnedLaw:

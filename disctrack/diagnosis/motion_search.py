@@ -38,7 +38,7 @@ Rolling = tuple[Fit, HeldOut]  # the model without slip, for a recording that be
 Answer = tuple[DiscSystem, Diagnosis, Rolling | None]
 
 
-def diagnose_motion(trajectory: Trajectory, model: Model, faults: Values, settings: Settings | None = None) -> Answer:
+def diagnose_motion(trajectory: Trajectory, model: Model, faults: Values, settings: Settings | None) -> Answer:
     """Diagnose a motion that rolls or slips at its start, with times corrected for pairs that both cameras lost.
 
     Raises AnalysisError.
@@ -99,7 +99,7 @@ def _rolling_or_slipping(settings: Settings, rolling: DiscSystem, base: Fit) -> 
     large = not base.reduced_chi_square <= FAR * noise_variance(rolling, base)
     if large and _slips_slowly(settings, rolling):
         return _slipping(settings, rolling, base, None)
-    rolls = _at_noise(rolling, base, settings) or first_contact(first_motion(rolling, rolling.known))[0] <= LEAST_SLIP
+    rolls = _at_noise(rolling, base, settings) or first_contact(first_motion(rolling))[0] <= LEAST_SLIP
     onset = None if rolls else _onset(rolling)
     # the data show both slip at the first frame and rolling at the end
     if onset is None or not (onset.low > rolling.time[0] and np.isfinite(onset.high)):

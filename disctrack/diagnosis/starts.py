@@ -36,11 +36,11 @@ REFITS = 2  # initial guesses that are returned
 SLOW = 3.0  # periods of a vibration in the recording at least
 
 
-def first_motion(system: DiscSystem, known: Values) -> MeasuredMotion:
-    """The first poses and their derivatives, at the instants corrected for these faults. Raises AnalysisError."""
+def first_motion(system: DiscSystem) -> MeasuredMotion:
+    """The first poses and their derivatives, at the instants corrected for the known faults. Raises AnalysisError."""
     n = int(np.flatnonzero(system.trajectory.measured[system.rows])[:SEGMENT][-1]) + 1
     first = part(system.trajectory, slice(system.rows.start, system.rows.start + n))
-    return differentiate(replace(first, time=system.instants(known)[:n]))
+    return differentiate(replace(first, time=system.instants(system.known)[:n]))
 
 
 def first_state(motion: MeasuredMotion) -> dict[str, float]:
@@ -58,10 +58,10 @@ def first_contact(motion: MeasuredMotion) -> tuple[float, float]:
     return float(slip), float(np.clip(np.nan_to_num(at_first[COLUMN["friction_needed"]], nan=np.inf), *FRICTIONS))
 
 
-def start_values(system: DiscSystem, known: Values) -> dict[str, float]:
-    """State and declared effects from which the fit of the whole recording converges; `known` values are held."""
-    names, motion = {quantity.name for quantity in system.base}, first_motion(system, known)
-    values = dict(known) | {k: v for k, v in first_state(motion).items() if k in names}
+def start_values(system: DiscSystem) -> dict[str, float]:
+    """State and declared effects from which the fit of the whole recording converges; the known faults are held."""
+    names, motion = {quantity.name for quantity in system.base}, first_motion(system)
+    values = system.known | {k: v for k, v in first_state(motion).items() if k in names}
     laws = model_quantities(system.model)
     values |= {law.name: system.model.values[law.name] for law in laws}
     if SLIP in names:

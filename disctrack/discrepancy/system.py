@@ -6,7 +6,7 @@ The engine (fit, score, held_out, search) depends on this interface alone; adapt
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -156,7 +156,7 @@ class System:
         """(n, w, b) orthonormal directions in which the residuals of a row may have common errors; all by default."""
         return np.tile(np.eye(width), (len(self.weights), 1, 1))
 
-    def beginnings(self) -> Sequence[System]:
+    def beginnings(self) -> Iterable[System]:
         """The system restricted to longer and longer first parts of the data."""
         return ()
 

@@ -12,7 +12,7 @@ from disctrack.diagnosis.errors import simulated
 from disctrack.diagnosis.form_misfit import moment_about_contact
 from disctrack.diagnosis.law_library import Family, families
 from disctrack.diagnosis.laws import _worth_a_refit, busy_amounts, learn, with_law, without_idle_terms
-from disctrack.diagnosis.missing_force import Gain, law_of, missing_moment, probe
+from disctrack.diagnosis.missing_force import Gain, law_of, missing_moment, probe, scan
 from disctrack.diagnosis.pages.output import as_json
 from disctrack.disc import MA_2014
 from disctrack.discrepancy.fit import Fit, fit
@@ -121,11 +121,11 @@ def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():
     spring = next(c for c in system.candidates if c.name == "spring")
     along = fit(system, (*base.quantities, *spring.quantities), base.values)
     assert along.reduced_chi_square < 0.01 * base.reduced_chi_square
-    scan, far = system.scan(along, base.quantities), system.scan(base)
-    square = [f for f in scan.library() if f.title.endswith("distance squared")]
-    (near,), (wrong,) = scan.gains(square), far.gains(square)
+    nearer, far = scan(system, along, base.quantities), scan(system, base)
+    square = [f for f in nearer.library() if f.title.endswith("distance squared")]
+    (near,), (wrong,) = nearer.gains(square), far.gains(square)
     n = np.sum(system.weights)
-    assert scan.chi_square - near.gain < 1.1 * n < 1.5 * n < far.chi_square - wrong.gain
+    assert nearer.chi_square - near.gain < 1.1 * n < 1.5 * n < far.chi_square - wrong.gain
     assert near.values[0] == pytest.approx(40.0, abs=1.0)
     assert wrong.values[0] > 60.0  # linear in the law, but along a motion that is no longer its own
     law = learn(system, base, 1.0, along, against=along.cost)
