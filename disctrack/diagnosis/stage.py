@@ -24,8 +24,7 @@ from disctrack.diagnosis.laws import WithLaw, explained_by_law, judged_as
 from disctrack.diagnosis.missing_force import missing_text
 from disctrack.diagnosis.model_file import PAPER, declared_model, model_toml
 from disctrack.diagnosis.motion_search import diagnose_motion, with_slip
-from disctrack.diagnosis.pages.output import as_json, write_diagnosis
-from disctrack.diagnosis.pages.report import report_of
+from disctrack.diagnosis.pages.output import as_json, report_of, write_diagnosis
 from disctrack.diagnosis.plan import open_questions, plan, planner_alone
 from disctrack.diagnosis.recorded import read_recorded
 from disctrack.diagnosis.supplement import supplement
@@ -40,7 +39,6 @@ from disctrack.errors import AnalysisError
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import refuse_existing, write_whole
-from disctrack.findings import carried
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
 from disctrack.trajectory import Trajectory
@@ -229,10 +227,7 @@ def run_diagnose(
     write_diagnosis(path, result, more, document)
     write_whole(report, json_file(document))
     write_whole(toml, model_toml(result.system, result.diagnosis.after.values, recorded.name).encode())
-    whole = report_of(
-        result, more, recorded.name, all_figures(result, more), carried(recorded.trajectory.findings),
-        files=(page, report, toml, path),
-    )  # fmt: skip
+    whole = report_of(result, more, recorded.name, all_figures(result, more), (page, report, toml, path))
     files = write_page(page, whole, ("png", "pdf") if figures else ())
     then = f"disctrack diagnose {path} --model {toml} -o {folder}_enlarged" if result.has_more else ""
     outcome = DiagnoseOutcome(result, (report, toml, page, *files), replace(whole, data=document, then=then))

@@ -77,14 +77,11 @@ def force_of(system: DiscSystem, fit: Fit) -> Array:
 
 def _ahead(result: DiscDiagnosis) -> tuple[tuple[Ahead, Ahead], ...]:
     """Errors at each horizon: of the free run over the held-out data, or beyond it of a run after a shorter fit."""
-    system, found = result.system, []
+    system, d, found = result.system, result.diagnosis, []
     last = system.time[system.weights > 0].max()
     for horizon in HORIZONS:
         rows, runs = np.asarray(system.time <= last - horizon - HALF_WINDOW, bool), list[Ahead]()
-        for fit, held in (
-            (result.diagnosis.before, result.diagnosis.held_out_before),
-            (result.diagnosis.after, result.diagnosis.held_out_after),
-        ):
+        for fit, held in ((d.before, d.held_out_before), (d.after, d.held_out_after)):
             run = None if held is None else free_run(system, held, horizon)
             if run is None and rows.sum() >= MIN_FRAMES:
                 run = free_run(system, held_out(system, fit.quantities, fit.values, rows), horizon)

@@ -132,7 +132,7 @@ def effect_json(found: Found, after: Fit) -> dict[str, Any]:
         "title": c.title,
         "source": c.source,
         "parameters": parameters_json(c.quantities, after),
-        "correlated": [vars(pair) for pair in correlated_pairs(found, after)],
+        "correlated": correlated_pairs(found, after),
         "class": [
             {
                 "name": r.candidate.name,
@@ -157,44 +157,38 @@ def explanations_json(d: Diagnosis) -> list[dict[str, Any]]:
     ]
 
 
-def declared_json(fit: Fit, with_known: bool = False) -> dict[str, Any]:
-    """Parameters of the declared laws with their standard deviations.   with_known : those with a prior, too"""
-    laws = [q for q in fit.quantities if not q.is_initial and (with_known or not np.isfinite(q.prior_sigma))]
-    return {q.name: {"value": fit.values[q.name], "sigma": fit.sigma(q.name), "unit": q.unit} for q in laws}
-
-
-def fit_errors(fit: Fit, held: HeldOut | None, noise: float = 1.0) -> dict[str, Any]:
+def fit_errors(fit: Fit, held: HeldOut | None, noise: float, with_known: bool) -> dict[str, Any]:
     """Keys `before` and `after` that all systems have; the system adds errors in its own units.
 
     noise : variance of the noise over that stated; the chi-squares are in units of it
+    with_known : as for `document`
     """
+    laws = [q for q in fit.quantities if not q.is_initial and (with_known or not np.isfinite(q.prior_sigma))]
     ratio = None if held is None or not np.isfinite(held.chi_square) else held.ratio_to_floor / np.sqrt(noise)
     return {
         "reduced_chi_square": fit.reduced_chi_square / noise,
         "held_out": {"ratio_to_noise_floor": ratio},
-        "parameters": declared_json(fit, with_known=True),
+        "parameters": {q.name: Measured(fit.values[q.name], fit.sigma(q.name), q.unit) for q in laws},
     }
 
 
 def document(
-    d: Diagnosis,
-    model: str,
-    sentence: str,
-    before: Mapping[str, Any] | None = None,
-    after: Mapping[str, Any] | None = None,
+    d: Diagnosis, model: str, sentence: str, *sides: Mapping[str, Any], with_known: bool = True
 ) -> dict[str, Any]:
-    """The diagnosis in JSON types; the keys are those that `disctrack diagnose` writes.
+    """The diagnosis in types that `json_text.plain` knows; the keys are those that `disctrack diagnose` writes.
 
-    before, after : errors in the system's own units, if it has such
+    sides : errors before and after in the system's own units, if it has such
+    with_known : are parameters with a prior among those of the laws?
     """
+    before, after = sides or ({}, {})
     return {
         "verdict": d.verdict,
         "sentence": sentence,
         "reason": d.reason,
         "model": model,
         "effects": [effect_json(f, d.after) for f in d.found],
-        "before": fit_errors(d.before, d.held_out_before, d.noise) | dict(before or {}),
-        "after": fit_errors(d.after, d.held_out_after, d.noise) | dict(after or {}),
+        "before": fit_errors(d.before, d.held_out_before, d.noise, with_known) | dict(before),
+        "after": fit_errors(d.after, d.held_out_after, d.noise, with_known) | dict(after),
         "noise_variance_over_stated": d.noise,
         "explanations": explanations_json(d),
         "tried": [
@@ -208,7 +202,7 @@ def document(
             }
             for t in d.tried
         ],
-        "settings": vars(d.settings),
+        "settings": d.settings,
     }
 
 
@@ -218,20 +212,19 @@ def tables(d: Diagnosis, hidden: tuple[str, ...] = ("state.", "learned.")) -> li
     hidden : prefixes of the names of parameters that are not listed; a learned law is shown by its course
     """
     fitted = [q for q in d.after.quantities if not (q.name.startswith(hidden) or q.is_initial)]
-    sides = [
-        [measured(f.values[q.name], f.sigma(q.name), q.unit) if q.name in f.names else "" for f in (d.before, d.after)]
-        for q in fitted
-    ]
-    chi = [rounded(f.reduced_chi_square / d.noise, 4) for f in (d.before, d.after)]
-    rows = [("chi-square per degree of freedom", *chi), *((q.name, *s) for q, s in zip(fitted, sides, strict=True))]
+    fits = d.before, d.after
+    rows = [("chi-square per degree of freedom", *(rounded(f.reduced_chi_square / d.noise, 4) for f in fits))]
+    for q in fitted:
+        sizes = (measured(f.values[q.name], f.sigma(q.name), q.unit) if q.name in f.names else "" for f in fits)
+        rows.append((q.name, *sizes))
     return [
-        Section("Explanations that compete", [explanations_table(d)]),
+        Section("Explanations that compete", [_explanations(d)]),
         Section("Fitted numbers", [Listing(("value ± 1 σ", "before", "after"), rows if fitted else ())]),
-        Section("What was tried", [tried_table(d)]),
+        Section("What was tried", [_tried(d)]),
     ]
 
 
-def explanations_table(d: Diagnosis) -> Listing:
+def _explanations(d: Diagnosis) -> Listing:
     """Sets of effects that are indistinguishable from the answer; empty where there is only one."""
     sets = explanations_json(d)
     rows = [
@@ -244,7 +237,7 @@ def explanations_table(d: Diagnosis) -> Listing:
     return Listing(("effects", "longer by", "odds against the answer"), rows if len(rows) > 1 else (), caption)
 
 
-def tried_table(d: Diagnosis) -> Listing:
+def _tried(d: Diagnosis) -> Listing:
     """Outcome of every candidate; empty columns are omitted."""
     rows = [
         (t.candidate.title, t.candidate.name, score(t.score), score(t.gain), score(t.held_out_gain), t.reason)

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.signal import periodogram
 
@@ -62,21 +61,22 @@ def superposed(result: DiscDiagnosis, more: Supplement) -> tuple[Drawn, Drawn]:
     system, time = result.system, result.system.time
     q = system.trajectory.q[system.rows]
     rate = np.full(len(time), np.nan) if more.psidot is None else more.psidot
-    nutation, precession, path = (
-        [Curve(x, y, MUTED, "measured", ".")]
-        for x, y in ((time, np.degrees(q[:, 4])), (time, rate), (1e3 * q[:, 0], 1e3 * q[:, 1]))
-    )
+    theta, (x, y) = np.degrees(q[:, 4]), 1e3 * q[:, :2].T
+    measured = (time, theta), (time, rate), (x, y)
+    nutation, precession, path = ([Curve(x, y, MUTED, "measured", ".")] for x, y in measured)
     for (fit, _, name, colour), style in zip(_sides(result), ("--", "-"), strict=False):
         motion = simulated(system, fit.values)
         instants, (x, y) = time[: len(motion)], 1e3 * motion.q[:, :2].T
         nutation.append(Curve(instants, np.degrees(motion.q[:, 4]), colour, name, style))
         precession.append(Curve(instants, motion.qdot[:, 3], colour, name, style))
         path.append(Curve(x, y, colour, name, style))
-    over_time = chart(
-        "time (s)", ("nutation angle (deg)", nutation), ("precession rate (rad/s)", precession), size=(9.5, 6.4)
-    )
-    for axes, measured in zip(over_time.axes, (np.degrees(q[:, 4]), rate), strict=True):
-        _frame(axes, measured)
+    rows = ("nutation angle (deg)", nutation), ("precession rate (rad/s)", precession)
+    over_time = chart("time (s)", *rows, size=(9.5, 6.4))
+    for axes, values in zip(over_time.axes, (theta, rate), strict=True):
+        known = values[np.isfinite(values)]
+        if known.size:  # limits by the data, with room for the legend; a model far from them may leave the axes
+            low, high = float(known.min()), float(known.max())
+            axes.set_ylim(low - 0.08 * (high - low or 1.0), high + 0.25 * (high - low or 1.0))
     caption = (
         "Nutation angle and precession rate: measured, and the model fitted to the measurement. "
         "The measured rate is the derivative of the poses, without any model."
@@ -84,14 +84,6 @@ def superposed(result: DiscDiagnosis, more: Supplement) -> tuple[Drawn, Drawn]:
     in_plane = chart("x (mm)", ("y (mm)", path), size=(6.0, 6.0), equal=True)
     drawn = Drawn("model_and_measurement", "Model and measurement", caption, over_time)
     return drawn, Drawn("path", "Path of the centre", "Path of the centre: measured, and fitted.", in_plane)
-
-
-def _frame(axes: Axes, values: Array) -> None:
-    """Limits by the data, with room for the legend; a model far from them may leave the axes."""
-    known = values[np.isfinite(values)]
-    if known.size:
-        low, high = float(known.min()), float(known.max())
-        axes.set_ylim(low - 0.08 * (high - low or 1.0), high + 0.25 * (high - low or 1.0))
 
 
 def residuals(result: DiscDiagnosis) -> Drawn:
@@ -128,9 +120,8 @@ def free_run(result: DiscDiagnosis) -> Drawn:
         add(error, colour, name)
         last = system.time[~held.test_rows & (system.weights > 0)].max()
     add(sigma, MUTED, "noise, 1 σ")
-    figure = chart(
-        "time (s)", ("error of position (mm)", position), ("error of nutation (deg)", nutation), size=(9.5, 4.4)
-    )
+    rows = ("error of position (mm)", position), ("error of nutation (deg)", nutation)
+    figure = chart("time (s)", *rows, size=(9.5, 4.4))
     for axes in figure.axes:
         axes.set_yscale("log")
         axes.axvline(last, color=AMBER, lw=1)
@@ -162,36 +153,30 @@ def candidates(result: DiscDiagnosis) -> Drawn:
     return Drawn("candidates", "What was tried", caption, figure)
 
 
-def _along_the_contact(known: Course, added: Course | None, label: str, scale: float, unit: str) -> Figure:
+def _along_the_contact(known: Course, added: Array | None, label: str, scale: float, unit: str) -> Figure:
     """The missing moment or force along n0, m0 and k with its band, and that added by the effects found.
 
     Without the ends, where derivatives are poorly determined.
     """
-    rows = []
+    rows, inner = [], slice(len(known.time) // 20, len(known.time) - len(known.time) // 20)
     for i, axis in enumerate(("n0", "m0", "k")):
-        inner = slice(len(known.time) // 20, len(known.time) - len(known.time) // 20)
         value, sigma = scale * known.values[inner, i], scale * known.sigma[inner, i]
         curves = [Curve(known.time[inner], value, RED, f"{label}, ± {BAND:g} σ", sigma=sigma)]
         if added is not None:
-            inner = slice(len(added.time) // 20, len(added.time) - len(added.time) // 20)
-            curves.append(Curve(added.time[inner], scale * added.values[inner, i], BLUE, "added by what was found"))
+            curves.append(Curve(known.time[inner], scale * added[inner, i], BLUE, "added by what was found"))
         rows.append((f"along {axis} ({unit})", curves))
     return chart("time (s)", *rows, size=(9.5, 5.4))
 
 
 def _missing(result: DiscDiagnosis, more: Supplement) -> list[Drawn]:
     """The moment and the force missing from the model before, and the laws with their uncertainty."""
-    found, learned = list[Drawn](), result.learned
+    found, learned, d = list[Drawn](), result.learned, result.diagnosis
     if more.moment is not None:
-        law = more.moment_of_law if result.has_more else None
-        of_law = "" if law is None else OF_LAW
-        figure = _along_the_contact(more.moment, law, "missing", 1e6, "µN m")
+        added, of_law = (None, "") if more.moment_of_law is None else (more.moment_of_law.values, OF_LAW)
+        figure = _along_the_contact(more.moment, added, "missing", 1e6, "µN m")
         found.append(Drawn("missing_moment", "The missing moment", f"{MISSING_MOMENT}{of_law}", figure))
     if more.force is not None:
-        added = None
-        if result.has_more:
-            change = force_of(result.system, result.diagnosis.after) - force_of(result.system, result.diagnosis.before)
-            added = Course(more.force.time, change, np.zeros_like(change))
+        added = force_of(result.system, d.after) - force_of(result.system, d.before) if result.has_more else None
         figure = _along_the_contact(more.force, added, "missing", 1e3, "mN")
         found.append(Drawn("missing_force", "The missing force", MISSING_FORCE, figure))
     if learned is not None and learned.course is not None:

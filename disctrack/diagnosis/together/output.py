@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from disctrack.diagnosis.answer import unnamed
-from disctrack.diagnosis.pages.output import plan_json
-from disctrack.diagnosis.pages.report import planned_section
-from disctrack.discrepancy.document import declared_json, document, effect_text, significance_text, tried_table
+from disctrack.diagnosis.pages.output import plan_json, planned_section
+from disctrack.discrepancy.document import document, effect_text, significance_text, tables
 from disctrack.discrepancy.joint.covariates import equivalent
 from disctrack.discrepancy.joint.together import Bound, Dependence, OfRecording, TogetherDiagnosis
 from disctrack.discrepancy.search import Diagnosis
@@ -74,10 +73,9 @@ def _dependence(x: Dependence) -> str:
 def as_json(answer: TogetherDiagnosis) -> dict[str, Any]:
     """The keys of diagnosis.json that apply; and recordings, bounds, dependences."""
     d = answer.diagnosis
-    before, after = ({"parameters": declared_json(fit)} for fit in (d.before, d.after))
     texts = verdict_text(answer), accuracy_text(answer), misfits_text(answer)
     sentence = " ".join(text for text in texts if text)
-    found = document(d, "shared by all recordings", sentence, before, after) | {
+    found = document(d, "shared by all recordings", sentence, with_known=False) | {
         "notes": list(answer.notes),
         "unusable": list(answer.unusable),
         "recordings": [_recording_json(r) for r in answer.recordings],
@@ -123,8 +121,8 @@ def report_of(answer: TogetherDiagnosis, drawn: Sequence[Drawn], files: Sequence
     d = answer.diagnosis
     effects = [f"{effect_text(f, d)}. {significance_text(f)}." for f in d.found]
     laws = [(q.name, Measured(d.after.values[q.name], d.after.sigma(q.name), q.unit)) for q in _free(d)]
-    tables = [table for x in answer.dependences for table in _dependence_tables(x)]
-    dependences = [[_dependence(x) for x in answer.dependences], *tables]
+    values = [table for x in answer.dependences for table in _dependence_tables(x)]
+    dependences = [[_dependence(x) for x in answer.dependences], *values]
     return Report(
         "Many recordings: what does the model lack?",
         verdict_text(answer),
@@ -138,7 +136,7 @@ def report_of(answer: TogetherDiagnosis, drawn: Sequence[Drawn], files: Sequence
             Section("Each recording against the others", [_recordings(answer)]),
             Section("What many recordings bring", [MANY, _by_number(answer)]),
             planned_section(answer.plan),
-            Section("What was tried", [tried_table(d)]),
+            tables(d)[-1],  # what was tried
         ],
         files=files,
         page=files[0],
