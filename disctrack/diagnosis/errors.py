@@ -156,14 +156,11 @@ def residual_tests(system: DiscSystem, fit_: Fit, noise: float) -> ResidualTests
     if n < MIN_FRAMES or most < 8:
         return ResidualTests()
     pose, other = (part[full] for part in system.parts_of_residual(fit_.values))
-    tested = whiteness(pose, system.rate, {})
-    return ResidualTests(
-        float(np.sum(pose**2) / max(6 * n - fit_.n_free, 1) / noise),
-        float(np.sum(other**2) / max((most - 6) * n, 1) / noise),
-        min(1.0, 2 * tested.p_value, 2 * 6 * float(tested.peak_p_value.min())),
-        whiteness(other, system.rate, {}).p_value,
-        12 + other.shape[1],
-    )
+    of_pose, of_other = (whiteness(part, system.rate, {}) for part in (pose, other))
+    pose_p_value = min(1.0, 2 * of_pose.p_value, 2 * 6 * float(of_pose.peak_p_value.min()))
+    pose_chi_square = float(np.sum(pose**2) / max(6 * n - fit_.n_free, 1) / noise)
+    other_chi_square = float(np.sum(other**2) / max((most - 6) * n, 1) / noise)
+    return ResidualTests(pose_chi_square, other_chi_square, pose_p_value, of_other.p_value, 12 + other.shape[1])
 
 
 # frames that the model describes, and the nutation where they end within the recording
@@ -195,7 +192,7 @@ def valid_ranges(system: DiscSystem, judged: System, base: Fit, noise: float) ->
     return {"first": longest(lambda k: frames[:k], -1), "last": longest(lambda k: frames[-k:], 0)}
 
 
-def validity_text(ranges: Mapping[str, ValidRange | None]) -> str:
+def ranges_text(ranges: Mapping[str, ValidRange | None]) -> str:
     """The valid ranges in words."""
     texts = []
     if first := ranges["first"]:

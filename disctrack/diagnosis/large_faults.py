@@ -50,24 +50,16 @@ def poses_with(trajectory: Trajectory, values: Values) -> Trajectory:
                 course = CubicSpline(trajectory.time[seen], pixels[seen, 1, dot])
                 moved[seen] = course(trajectory.time[seen] - faults.right_delay_s, extrapolate=False)
             pixels[:, 1, dot] = moved
-    dots = DotsInFrames(
-        cameras_with(faults, trajectory.rig),
-        replace(trajectory.disc, marker_centres_body=centres_with(faults, trajectory.disc)),
-        pixels,
-        trajectory.markers_covariance_px2,
-        rotation_from_euler(*trajectory.q[:, 3:].T),
-        trajectory.q[:, :3],
-    )
+    rig, disc = cameras_with(faults, trajectory.rig), trajectory.disc
+    disc = replace(disc, marker_centres_body=centres_with(faults, disc))
+    poses = rotation_from_euler(*trajectory.q[:, 3:].T), trajectory.q[:, :3]
+    dots = DotsInFrames(rig, disc, pixels, trajectory.markers_covariance_px2, *poses)
     fits = fit_poses(dots, reject_outliers=False, with_sensitivity=False)
     angles = np.full((len(trajectory), 3), np.nan)
     angles[fits.converged] = unwrap_euler(euler_from_rotation(fits.R_world_body[fits.converged]))
-    return replace(
-        trajectory,
-        q=np.column_stack([fits.t_world_body, angles]),
-        pose_covariance=fits.covariance,
-        markers_residual_px=fits.residuals_px,
-        reduced_chi_square=fits.reduced_chi_square,
-    )
+    q = np.column_stack([fits.t_world_body, angles])
+    posed = replace(trajectory, q=q, pose_covariance=fits.covariance)
+    return replace(posed, markers_residual_px=fits.residuals_px, reduced_chi_square=fits.reduced_chi_square)
 
 
 def large_faults(as_tracked: Trajectory, system: DiscSystem, first: Systematic) -> tuple[DiscSystem, Former] | None:

@@ -36,8 +36,7 @@ def declared_model(trajectory: Trajectory, choice: str = PAPER) -> tuple[Model, 
     scene = load_scene(choice)
     rolling = scene.motion.rolling
     effects = effects_from_tables(rolling.effects, rolling.formulas)
-    faults = values_in_scene(trajectory.disc, scene.faults, scene.cameras.frame_rate_hz)
-    return replace(bare, effects=effects), faults
+    return replace(bare, effects=effects), values_in_scene(bare.disc, scene.faults, scene.cameras.frame_rate_hz)
 
 
 def model_toml(system: DiscSystem, values: Values, name: str) -> str:

@@ -48,25 +48,17 @@ def slip_start(model: Model) -> Candidate:
 
 def effect_quantity(effect: type[Effect], parameter: EffectParameter) -> Quantity:
     """A parameter of an effect as a quantity of a fit."""
-    null = parameter.nominal if parameter.is_shape else parameter.null
-    return Quantity(
-        f"{effect.name}.{parameter.name}",
-        parameter.unit,
-        0.01 * abs(parameter.nominal),
-        null=null,
-        lower=parameter.lower,
-        upper=parameter.upper,
-        meaning=parameter.meaning,
-        typical=abs(parameter.nominal) or np.inf,  # a position may be anywhere
-        belongs_to=effect.belongs_to,
-    )
+    p, size = parameter, abs(parameter.nominal)
+    null = p.nominal if p.is_shape else p.null
+    one = Quantity(f"{effect.name}.{p.name}", p.unit, 0.01 * size, null, p.lower, p.upper, meaning=p.meaning)
+    typical = size or np.inf  # a position may be anywhere
+    return replace(one, typical=typical, belongs_to=effect.belongs_to)
 
 
 def model_quantities(model: Model) -> tuple[Quantity, ...]:
     """Parameters of the effects that the model declares: they are fitted within their bounds."""
-    return tuple(
-        effect_quantity(type(effect), p) for effect in model.effects for p in effect.parameters if not p.is_shape
-    )
+    amounts = ((type(effect), p) for effect in model.effects for p in effect.parameters if not p.is_shape)
+    return tuple(effect_quantity(effect, p) for effect, p in amounts)
 
 
 def motion_candidates(model: Model, names: Sequence[str] | None = None) -> tuple[Candidate, ...]:

@@ -35,12 +35,9 @@ def read_recorded(path: Path) -> Recorded:
     """From a trajectory file. Raises TrajectoryFileError."""
     provenance = read_provenance(path)
     declared = provenance.settings.get("recording", {})
-    return Recorded(
-        provenance.recording,
-        with_declared_dots(read_trajectory(path), read_details(path)),
-        str(declared.get("surface", "")),
-        str(declared.get("disc", {}).get("name", "")),
-    )
+    trajectory = with_declared_dots(read_trajectory(path), read_details(path))
+    surface, disc = declared.get("surface", ""), declared.get("disc", {}).get("name", "")
+    return Recorded(provenance.recording, trajectory, str(surface), str(disc))
 
 
 def with_declared_dots(trajectory: Trajectory, details: Mapping[str, Any]) -> Trajectory:

@@ -11,14 +11,7 @@ from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
 from disctrack.diagnosis.answer import DiscDiagnosis, Learned
 from disctrack.diagnosis.disc_system import DiscSystem
-from disctrack.diagnosis.errors import (
-    ResidualTests,
-    energy_balance,
-    errors,
-    residual_tests,
-    valid_ranges,
-    validity_text,
-)
+from disctrack.diagnosis.errors import ResidualTests, energy_balance, errors, ranges_text, residual_tests, valid_ranges
 from disctrack.diagnosis.form_misfit import with_form
 from disctrack.diagnosis.laws import WithLaw, explained_by_law, judged_as
 from disctrack.diagnosis.missing_force import missing_text
@@ -80,7 +73,7 @@ def diagnose(trajectory: Trajectory, model: str = PAPER, settings: Settings | No
     holds, learned, notes = {}, None, diagnosis.remarks
     if diagnosis.verdict == "unexplained":
         holds = valid_ranges(system, judged_as(diagnosis, system), diagnosis.before, diagnosis.noise)
-        notes = (*notes, validity_text(holds), "" if found else missing_text(system, diagnosis.after))
+        notes = (*notes, ranges_text(holds), "" if found else missing_text(system, diagnosis.after))
     if found is not None:
         system, learned, diagnosis, not_claimed = _with_law(system, diagnosis, found)
         tests, notes = residual_tests(system, diagnosis.after, diagnosis.noise), (*notes, *not_claimed)
@@ -151,10 +144,8 @@ def _with_law(
     gain = (diagnosis.before.cost - fitted.cost) / noise
     learned = Learned(law.candidate, gain, held_gain, np.nan, (), law, power, course, misfit)
     reason = f"{diagnosis.reason}; the law that was learned leaves {fitted.reduced_chi_square:.3g}"
-    diagnosis = replace(
-        diagnosis, verdict="unexplained", found=established, after=after, held_out_after=held, reason=reason
-    )
-    return known, learned, diagnosis, not_claimed
+    diagnosis = replace(diagnosis, found=established, after=after, held_out_after=held)
+    return known, learned, replace(diagnosis, verdict="unexplained", reason=reason), not_claimed
 
 
 def _for_any_form(kept: Sequence[Found], fitted: Fit, looked: float) -> tuple[tuple[Found, ...], tuple[str, ...]]:

@@ -3,13 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.arrays import Array, Indices, Mask
 from disctrack.errors import AnalysisError
 from disctrack.frames import rotation_from_euler, vector_from_rotation
 from disctrack.track.side_by_side import stretches
 from disctrack.trajectory import Trajectory
-
-Rows = NDArray[np.int64]
 
 MIN_THETA = np.radians(0.7)  # below, the disc of Ma et al. touches its paper, and the model does not hold
 MIN_FRAMES = 40
@@ -65,7 +63,7 @@ def _counts(why: NDArray[np.str_]) -> list[str]:
     return [f"{text} in {n} of them" for text, n in counts.items() if n]
 
 
-def at_rest(trajectory: Trajectory, measured: Rows) -> Mask:
+def at_rest(trajectory: Trajectory, measured: Indices) -> Mask:
     """(k,) True for frames among `measured` before or after which the disc does not rotate."""
     if len(measured) < 2:
         return np.ones(len(measured), bool)

@@ -75,12 +75,9 @@ def with_noise_of_frames(trajectory: Trajectory) -> Trajectory:
 
 def with_noise(trajectory: Trajectory, ratio: float) -> Trajectory:
     """The trajectory with its covariances multiplied by a ratio."""
-    return replace(
-        trajectory,
-        pose_covariance=ratio * trajectory.pose_covariance,
-        markers_covariance_px2=ratio * trajectory.markers_covariance_px2,
-        reduced_chi_square=trajectory.reduced_chi_square / ratio,
-    )
+    poses, dots = ratio * trajectory.pose_covariance, ratio * trajectory.markers_covariance_px2
+    reduced = trajectory.reduced_chi_square / ratio
+    return replace(trajectory, pose_covariance=poses, markers_covariance_px2=dots, reduced_chi_square=reduced)
 
 
 @dataclass(frozen=True)
@@ -201,17 +198,15 @@ def _best_sizes(likelihood: Likelihood, sizes: Sizes, grids: Mapping[str, Array]
     return best, sizes
 
 
-def _with_faults(
-    likelihood: Likelihood, sizes: Sizes, faults: Mapping[str, float]
-) -> tuple[float, Sizes, tuple[str, ...]]:
+def _with_faults(likelihood: Likelihood, sizes: Sizes, faults: Mapping[str, float]) -> tuple[float, Sizes]:
     """Forward selection of the faults that increase the likelihood at these sizes."""
-    best, chosen = likelihood.at(sizes)[0], tuple[str, ...]()
+    best = likelihood.at(sizes)[0]
     while True:
         trials = {name: likelihood.at(sizes | {name: size})[0] for name, size in faults.items() if name not in sizes}
         name = max(trials, key=lambda n: trials[n], default="")
         if not name or trials[name] < best + WORTH:
-            return best, sizes, chosen
-        best, sizes, chosen = trials[name], sizes | {name: faults[name]}, (*chosen, name)
+            return best, sizes
+        best, sizes = trials[name], sizes | {name: faults[name]}
 
 
 def find_systematic(system: DiscSystem) -> Systematic:
@@ -257,7 +252,8 @@ def find_systematic(system: DiscSystem) -> Systematic:
         sought, fields = (grids, {"lens": field(share * extent)}) if share else ({}, {})
         likelihood = Likelihood(data, groups | fields)
         value, sizes = _best_sizes(likelihood, dict(start), sought)
-        value, sizes, chosen = _with_faults(likelihood, sizes, offered)
+        value, sizes = _with_faults(likelihood, sizes, offered)
+        chosen = [name for name in sizes if name in offered]
         if chosen:  # the faults have reduced the fields
             value, sizes = _best_sizes(likelihood, start | {name: typical[name] for name in chosen}, sought)
         if share and value < most + WORTH:

@@ -256,17 +256,13 @@ def noise_sigma(values: Sequence[Array], times: Sequence[Array] | None = None) -
     """
     times = times or [np.arange(len(v), dtype=float) for v in values]
     seen = [(t[p], v[p]) for t, v in zip(times, values, strict=True) for p in [np.isfinite(v)]]
-    estimates, counts = [], []
-    for order in _ORDERS:
-        differences = np.concatenate([_divided(t, v, order) for t, v in seen])
-        if len(differences):
-            estimates.append(float(np.sqrt(np.mean(differences**2))))
-            counts.append(len(differences))
+    of_order = (np.concatenate([_divided(t, v, order) for t, v in seen]) for order in _ORDERS)
+    differences = [d for d in of_order if len(d)]
+    estimates = [float(np.sqrt(np.mean(d**2))) for d in differences]
     # the lowest order that is not larger than the next one by more than its scatter: higher orders scatter more
-    best = next(
-        (a for a, b, n in zip(estimates, estimates[1:], counts, strict=False) if a <= b * (1 + 2 / np.sqrt(n))),
-        estimates[-1] if estimates else 0.0,
-    )
+    triples = zip(estimates, estimates[1:], differences, strict=False)
+    near = (a for a, b, d in triples if a <= b * (1 + 2 / np.sqrt(len(d))))
+    best = next(near, estimates[-1] if estimates else 0.0)
     size = max((float(np.max(np.abs(v))) for _, v in seen if len(v)), default=1.0)
     return max(best, 1e-9 * size, 1e-300)
 

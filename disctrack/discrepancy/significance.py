@@ -101,8 +101,7 @@ def chance(linear: Linearisation, scores: Sequence[Score], noise: float, draws: 
         quantities = [linear.quantities[n] for n in s.candidate.names]
         if len(quantities) == 1 and linear.values[quantities[0].name] <= quantities[0].lower:
             along = np.maximum(along, 0.0)  # one-sided: an effect that may only brake
-        of_one = stats.chi2.logsf(np.sum(along**2, axis=1), len(s.candidate.names))
-        np.maximum(largest, -of_one, out=largest)
+        np.maximum(largest, -stats.chi2.logsf(np.sum(along**2, axis=1), len(quantities)), out=largest)
     largest.sort()
     tests = LAST / draws * float(np.exp(largest[-LAST]))  # beyond it the tail is that of so many single trials
     return Chance(tail(observed, largest, 1.0), tests)
@@ -155,13 +154,13 @@ def _drawn(n: int, lags: int) -> Array:
     return np.sort(ljung_box(np.random.default_rng(n).standard_normal((n, DRAWS)), lags))
 
 
-def whiteness(residual: Array, rate: float, lines: Mapping[str, float], lags: int = LAGS) -> Whiteness:
+def whiteness(residual: Array, rate: float, lines: Mapping[str, float]) -> Whiteness:
     """Ljung-Box test and periodogram of residuals (n, c) sampled at `rate` [Hz], without gaps.
 
     lines : frequencies [Hz] by name, at which a physical effect would show
     """
     n, channels = residual.shape
-    lags = min(lags, max(1, n // 4))
+    lags = min(LAGS, max(1, n // 4))
     statistic = ljung_box(residual, lags)
     p = min(1.0, channels * ljung_box_p_value(float(statistic.max()), n, lags))
     frequency, power = signal.periodogram(residual, rate, detrend="constant", axis=0)

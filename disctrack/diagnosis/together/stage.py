@@ -54,15 +54,9 @@ def run_together(
     read, unread = _read(paths)
     if not read:
         raise AnalysisError("; ".join(f"{path}: {reason}" for path, reason in unread.items()))
-    inputs = {
-        "model": content_of(model),
-        "plan": settle,
-        "files": [read_provenance(p).fingerprint for p in read],
-        "unread": unread,
-    }
-    origin = hash_of(inputs)
-    earlier = reusable(folder, origin) if reuse else None
-    if earlier is not None:
+    contents = [read_provenance(p).fingerprint for p in read]
+    origin = hash_of({"model": content_of(model), "plan": settle, "files": contents, "unread": unread})
+    if reuse and (earlier := reusable(folder, origin)) is not None:
         return earlier
     refuse_existing(report, overwrite)
     refuse_input(report)
