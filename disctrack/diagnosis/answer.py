@@ -76,7 +76,7 @@ class DiscDiagnosis(Brief):
     @property
     def sentence(self) -> str:
         """The answer in one or a few sentences."""
-        return " ".join(text for text in (self.verdict_text, self.accuracy_text, *self.remarks) if text)
+        return " ".join(filter(None, (self.verdict_text, self.accuracy_text, *self.remarks)))
 
     @property
     def verdict_text(self) -> str:

@@ -64,7 +64,9 @@ class Linearisation:
     def basis_without(self, freed: Sequence[str]) -> Array:
         """Orthonormal basis (m, b) of the fitted columns, without those of quantities that a candidate frees."""
         free = [i for i, q in enumerate(self.fitted) if q.name not in freed and q.lower < self._at[i] < q.upper]
-        return np.linalg.qr(_normalised(self.matrix[:, free]))[0]
+        columns = self.matrix[:, free]
+        length = np.linalg.norm(columns, axis=0)
+        return np.linalg.qr(columns / np.where(length > 0, length, 1.0))[0]
 
     def columns(self, names: Sequence[str]) -> Array:
         """Columns (m, k), not orthogonalised."""
@@ -105,11 +107,6 @@ def span(columns: Array) -> Array:
     length = np.linalg.norm(columns, axis=0)
     U, singular, _ = np.linalg.svd(columns[:, length > 0] / length[length > 0], full_matrices=False)
     return np.asarray(U[:, singular > DEPENDENT * singular[0]] if singular.size else U, float)
-
-
-def _normalised(columns: Array) -> Array:
-    length = np.linalg.norm(columns, axis=0)
-    return columns / np.where(length > 0, length, 1.0)
 
 
 def score(linear: Linearisation, candidate: Candidate) -> Score:

@@ -73,8 +73,7 @@ def _dependence(x: Dependence) -> str:
 def as_json(answer: TogetherDiagnosis) -> dict[str, Any]:
     """The keys of diagnosis.json that apply; and recordings, bounds, dependences."""
     d = answer.diagnosis
-    texts = verdict_text(answer), accuracy_text(answer), misfits_text(answer)
-    sentence = " ".join(text for text in texts if text)
+    sentence = " ".join(filter(None, (verdict_text(answer), accuracy_text(answer), misfits_text(answer))))
     found = document(d, "shared by all recordings", sentence, with_known=False) | {
         "notes": list(answer.notes),
         "unusable": list(answer.unusable),
