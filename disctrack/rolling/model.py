@@ -38,9 +38,8 @@ class Model:
         object.__setattr__(self, "effects", tuple(self.effects))
         object.__setattr__(self, "laws", tuple(self.laws))
         names = [effect.name for effect in self.effects]
-        for name in names:
-            if names.count(name) > 1:
-                raise ModelError(f"effect '{name}' is in the model twice: give it once, with the sum of its amounts")
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ModelError(f"effect '{twice[0]}' is in the model twice: give it once, with the sum of its amounts")
 
     @property
     def values(self) -> dict[str, float]:
@@ -58,8 +57,7 @@ class Model:
 
     def with_effects(self, *effects: Effect) -> Model:
         """Copy with these effects appended, or in place of those of the same name."""
-        new = {e.name: e for e in self.effects} | {e.name: e for e in effects}
-        return replace(self, effects=tuple(new.values()))
+        return replace(self, effects=tuple({e.name: e for e in (*self.effects, *effects)}.values()))
 
     def with_values(self, values: Mapping[str, float]) -> Model:
         """Copy with new values by "effect.parameter"; effects not in the model are added, other parameters at null."""
@@ -71,8 +69,7 @@ class Model:
 
     def knowing(self, *laws: type[Effect]) -> Model:
         """Copy that also accepts parameters of these laws, which replace laws of the same name."""
-        new = {law.name: law for law in self.laws} | {law.name: law for law in laws}
-        return replace(self, laws=tuple(new.values()))
+        return replace(self, laws=tuple({law.name: law for law in (*self.laws, *laws)}.values()))
 
     def effect_class(self, name: str) -> type[Effect]:
         """Class of the effect of this name: in the model, among its laws, or in the catalogue; raises ModelError."""
@@ -97,7 +94,7 @@ class Model:
         return True
 
 
-def body_constants(model: Model, theta_end: float, values: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def body_constants(model: Model, theta_end: float, values: Mapping[str, Any] = {}) -> dict[str, Any]:
     """Constants of records.BODY after all adjustments; complex if they depend on complex `values` (by full name)."""
     disc = model.disc
     body = SimpleNamespace(**dict.fromkeys(BODY, 0.0))
@@ -114,10 +111,9 @@ def body_constants(model: Model, theta_end: float, values: Mapping[str, Any] | N
     return vars(body)
 
 
-def effect_values(effect: Effect, values: Mapping[str, Any] | None) -> dict[str, Any]:
+def effect_values(effect: Effect, values: Mapping[str, Any]) -> dict[str, Any]:
     """Parameter values of one effect; `values` (by full name) take precedence."""
-    given = values or {}
-    return {name: given.get(f"{effect.name}.{name}", value) for name, value in effect.values.items()}
+    return {name: values.get(f"{effect.name}.{name}", value) for name, value in effect.values.items()}
 
 
 def effects_from_tables(

@@ -144,9 +144,8 @@ class Motion(Brief):
         slip = columns(now, "slip_n", "slip_m")
         slip[path.regime == Regime.ROLLING] = 0.0
         self.slip_velocity: Array = slip  # (n, 2) of the disc's material point at the contact, along n0, m0 [m/s]
-        slips = path.regime == Regime.SLIPPING
-        by_slip = np.where(slips, np.sum(self.contact_force[:, :2] * slip, axis=-1), 0.0)
-        power = moment_power(now, self.contact_moment) + by_slip
+        # in rolling there is no slip, in flight no force
+        power = moment_power(now, self.contact_moment) + np.sum(self.contact_force[:, :2] * slip, axis=-1)
         power += np.sum(_transformed(contact, at_O) * self.qdot[:, :3], axis=-1) + np.sum(pull * v_G, axis=-1)
         # (n,) [W] power of contact force, moments and external force: dE/dt
         self.power: Array = power + np.sum(_transformed(contact, self.contact_force) * table_velocity, axis=-1)

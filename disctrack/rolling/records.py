@@ -16,6 +16,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from disctrack.frames import COORDINATES
+
 Record: TypeAlias = "np.recarray[Any, Any]"  # the numbers of one kind below, read and written by name
 Records: TypeAlias = NDArray[np.void]  # an array of them
 
@@ -34,10 +36,7 @@ STATE_COMPONENTS = (*ROLLING_COMPONENTS, "v_x", "v_y", "z", "v_z")
 # Input of the laws of the effects. Vectors are in the contact frame (n0, m0, k), n0 = e1, m0 = k x n0.
 KINEMATICS = (
     "time",
-    *"xyz",  # O in world axes [m]
-    "psi",  # precession, nutation, spin [rad]
-    "theta",
-    "phi",
+    *COORDINATES,  # O in world axes [m]; precession, nutation, spin [rad]
     "sin_theta",
     "cos_theta",
     "thetadot",  # [rad/s]

@@ -116,7 +116,7 @@ class Assembly:
     Not thread-safe: `instant` is scratch space.
     """
 
-    def __init__(self, model: Model, theta_end: float, scalar: type = float, values: Mapping[str, Any] | None = None):
+    def __init__(self, model: Model, theta_end: float, scalar: type = float, values: Mapping[str, Any] = {}):
         """Values (by full name, complex if `scalar` is) take precedence over the model's."""
         constants = body_constants(model, theta_end, values)
         self.scalar = scalar
@@ -156,11 +156,6 @@ class Assembly:
         """One of records.BODY."""
         return self.body[name][0]
 
-    @property
-    def on_a_film(self) -> bool:
-        """Does the contact creep so fast that its velocity is part of the state? Coulomb friction takes precedence."""
-        return bool(self.constant("creep").real > FILM and self.constant("inverse_friction") == 0.0)
-
 
 def follow(
     assembly: Assembly,
@@ -181,12 +176,14 @@ def follow(
     segments, switches = list[tuple[Records, Array]](), list[Switch]()
     end: EndReason | None = None
     i, n_steps = 0, 0
+    # whether the contact creeps so fast that its velocity is part of the state; Coulomb friction takes precedence
+    on_a_film = assembly.constant("creep").real > FILM and assembly.constant("inverse_friction") == 0.0
 
     def add(times: Array, Y: Numbers) -> None:
         segments.append((assembly.at(regime, times, Y)[2], np.full(len(times), regime, np.uint8)))
 
     while end is None:
-        if regime == ROLLING and assembly.on_a_film:
+        if regime == ROLLING and on_a_film:
             regime, y = SLIPPING, np.concatenate([y, assembly.at(ROLLING, t, y)[0][0, :2]])
         event = _event_at_start(assembly, regime, t, y)
         if event < 0:

@@ -40,8 +40,7 @@ class State:
     @property
     def array(self) -> Array:
         """Components that are not None: (8,), (10,) or (12,)."""
-        given = [value for value in astuple(self) if value is not None]
-        return np.array(given, float)
+        return np.array([value for value in astuple(self) if value is not None], float)
 
     @property
     def psidot(self) -> float:
