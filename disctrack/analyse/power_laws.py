@@ -109,7 +109,7 @@ def fit_power_laws(
     (cluster-robust covariance), so that neighbouring frames do not count as independent.
     """
     usable = np.isfinite(psi) & (theta > 0) & (psidot > 0)
-    end = power_law_end(time, psi, psidot) if usable.any() else np.inf
+    end = power_law_end(time, psi, psidot)
     usable &= time <= end
     if usable.sum() < MIN_FRAMES:
         return PowerLaws(
@@ -134,12 +134,14 @@ def fit_power_laws(
 
 
 def power_law_end(time: Array, psi: Array, psidot: Array) -> float:
-    """Last instant [s] of the law: the end of the recording, or shortly before psidot collapses.
+    """Last instant [s] of the law: the end of the recording, or shortly before psidot collapses; inf if it is unknown.
 
     At the very end a paper patch or the flat face touches the table and brakes the precession within 20 ms. The
     criterion is psidot averaged over a turn, so that the nutation does not count as braking.
     """
     known = np.flatnonzero(np.isfinite(psidot) & np.isfinite(psi))
+    if not known.size:
+        return np.inf
     turned = np.maximum.accumulate(psi[known])  # the angle of a stopped disc only fluctuates
     before = np.interp(turned - 2 * np.pi, turned, time[known], left=np.nan)
     mean = 2 * np.pi / (time[known] - before)  # over the turn that ends here
@@ -231,9 +233,9 @@ def _judged(fit: _Fit, ln_energy: Array) -> PowerLaws:
     longest, shortest = float(fit.t_f - fit.time[0]), float(fit.t_f - fit.time[-1])
     periods = float(np.ptp(fit.phase)) / (2 * np.pi)
     linear, sigma, t_f_sigma = _linear_with_sigma(fit)
+    laws = PowerLaws("", (longest, shortest), periods, fit.t_f, t_f_sigma)
     if periods < MIN_PERIODS:
-        reason = f"only {periods:.1f} nutation periods in the window, {MIN_PERIODS} are needed"
-        return PowerLaws(reason, (longest, shortest), periods, fit.t_f, t_f_sigma)
+        return replace(laws, reason=f"only {periods:.1f} nutation periods in the window, {MIN_PERIODS} are needed")
     quantile = float(stdtrit(max(2.0, fit.period.max() + 1 - 4.0), 0.975))
 
     def exponent(value: float, sigma: float) -> Exponent:
@@ -244,17 +246,9 @@ def _judged(fit: _Fit, ln_energy: Array) -> PowerLaws:
         found, residual = fit.linear(ln_energy)
         variance = _clustered(fit.design()[None], residual, fit.period)[1, 1]
         of_energy = exponent(found[1, 0], np.sqrt(variance + (_per_t_f(fit, ln_energy) * t_f_sigma) ** 2))
-    return PowerLaws(
-        "",
-        (longest, shortest),
-        periods,
-        fit.t_f,
-        t_f_sigma,
-        exponent(linear[1, 0], sigma[0, 1]),
-        exponent(linear[1, 1], sigma[1, 1]),
-        of_energy,
-        _per_t_f(fit, fit.data[:1]),
-    )
+    n_theta, n_psidot = map(exponent, linear[1], sigma[:, 1])
+    per_t_f = _per_t_f(fit, fit.data[:1])
+    return replace(laws, n_theta=n_theta, n_psidot=n_psidot, n_energy=of_energy, n_theta_per_t_f=per_t_f)
 
 
 def _linear_with_sigma(fit: _Fit) -> tuple[Array, Array, float]:
@@ -331,4 +325,4 @@ def nutation_ratio(theta: float, disc: Disc) -> float:
     try:
         return nutation_frequency(theta, disc) / precession_rate(theta, disc)[0]
     except ModelError:
-        return float("nan")
+        return NAN
