@@ -87,25 +87,26 @@ def write_analysis(path: Path, analysis: Analysis) -> None:
     Frames outside the tracked part are NaN.
     """
     file_time = read_group(path, "/", ("time",))[0]["time"]
-    first = int(np.searchsorted(file_time, analysis.motion.time[0] - 1e-9))
-
-    def whole(variables: dict[str, Variable]) -> dict[str, Variable]:
-        """Series from frame `first` on, extended to all frames of the file."""
-        return {
-            name: replace(item, data=among(len(file_time), first, np.asarray(item.data)))
-            for name, item in variables.items()
-        }
-
+    n, first = len(file_time), int(np.searchsorted(file_time, analysis.motion.time[0] - 1e-9))
     attributes: dict[str, dict[str, object]] = {
-        "motion": _motion_attributes(analysis),
+        "motion": {
+            "method": "Gaussian-process regression in moving windows, squared-exponential covariance on a straight "
+            "line; length and amplitude by restricted maximum likelihood",
+            "groups": ", ".join(CHANNELS),
+            "median_length_s": np.median(analysis.motion.length, axis=0),
+            "noise_scale": analysis.motion.noise_scale,
+            "warnings": "\n".join(finding.text for finding in analysis.findings),
+        },
         "contact": _attributes(analysis.onset) | _attributes(analysis.circle),
         "energy": _attributes(analysis.energy),
     }
     groups: dict[str, Group] = {}
     for group, rows in QUANTITIES.items():
         variables = _series_variables([analysis.series(name) for name, *_ in rows])
-        more = _motion_variables(analysis.motion) if group == "motion" else {}
-        groups[group] = whole(variables | more), attributes[group]
+        if group == "motion":
+            variables |= _motion_variables(analysis.motion)
+        whole = {name: replace(s, data=among(n, first, np.asarray(s.data))) for name, s in variables.items()}
+        groups[group] = whole, attributes[group]
     groups["scaling"] = _scaling_group(analysis)
     axes = {"scaling_window": Variable(WINDOWS, ("scaling_window",), "s", "longest time before t_f in the fit")}
     what = "position, rotation vector, velocity, angular velocity, acceleration, angular acceleration; world axes"
@@ -154,34 +155,20 @@ def _motion_variables(motion: MeasuredMotion) -> dict[str, Variable]:
     }
 
 
-def _motion_attributes(analysis: Analysis) -> dict[str, object]:
-    motion = analysis.motion
-    return {
-        "method": "Gaussian-process regression in moving windows, squared-exponential covariance on a straight line; "
-        "length and amplitude by restricted maximum likelihood",
-        "groups": ", ".join(CHANNELS),
-        "median_length_s": np.median(motion.length, axis=0),
-        "noise_scale": motion.noise_scale,
-        "warnings": "\n".join(finding.text for finding in analysis.findings),
-    }
-
-
 def _scaling_group(analysis: Analysis) -> Group:
     laws, fits = analysis.laws, analysis.laws_by_window
     attributes = _attributes(laws) | _attributes(analysis.nutation_count)
-    found = {"t_f": ([fit.t_f for fit in fits], "s", "instant of collapse fitted in the window")}
-    found["t_f_sigma"] = [fit.t_f_sigma for fit in fits], "s", "standard deviation of t_f"
+    axes, t_f, t_f_sigma = ("scaling_window",), [fit.t_f for fit in fits], [fit.t_f_sigma for fit in fits]
+    variables = {
+        "t_f": Variable(t_f, axes, "s", "instant of collapse fitted in the window"),
+        "t_f_sigma": Variable(t_f_sigma, axes, "s", "standard deviation of t_f"),
+    }
     for name, text in (("n_theta", "nutation"), ("n_psidot", "precession rate"), ("n_energy", "energy")):
         exponent = getattr(laws, name)
-        attributes[name] = exponent.value
-        attributes[f"{name}_sigma"] = exponent.sigma
+        attributes |= {name: exponent.value, f"{name}_sigma": exponent.sigma}
         attributes[f"{name}_confidence_95"] = np.array([exponent.low, exponent.high])
         for part in ("value", "sigma", "low", "high"):
             values = [getattr(getattr(fit, name), part) for fit in fits]
             key = name if part == "value" else f"{name}_{part}"
-            found[key] = values, "1", f"exponent of the {text} in t_f - t, {part}"
-    variables = {
-        name: Variable(np.array(values), ("scaling_window",), unit, text)
-        for name, (values, unit, text) in found.items()
-    }
+            variables[key] = Variable(values, axes, "1", f"exponent of the {text} in t_f - t, {part}")
     return variables, attributes
