@@ -87,9 +87,7 @@ def contradictions(
     boards : in the views of the calibration;  blur_px : of the edges of the dots, per camera
     """
     disc, board = disc or trajectory.disc, None if recording is None else recording.chessboard
-    square = None if board is None else board.square
-    found = [*density(disc), *scale_of_dots(trajectory, disc, square), *unseen_dots(trajectory, disc)]
-    found += lost_pairs(trajectory)
+    found = [*density(disc), *scale_of_dots(trajectory, disc), *unseen_dots(trajectory, disc), *lost_pairs(trajectory)]
     if trajectory.rig.world_is_table:
         found += handedness(trajectory.rig, disc)
         off = next((f for f in noticed if f.kind == Kind.TABLE_DISAGREES), None)
@@ -100,11 +98,11 @@ def contradictions(
         if recording is not None and recording.table is not None and off is not None and not elsewhere:
             found += thickness(disc, recording.table.board_thickness, off)
     found += () if board is None else turned_board(board.inner_corners)
-    return (*found, *with_square(noticed, recording), *(unsharp(trajectory, blur_px) if blur_px else ()))
+    return (*with_square([*found, *noticed], recording), *(unsharp(trajectory, blur_px) if blur_px else ()))
 
 
 def with_square(findings: Sequence[Finding], recording: Recording | None) -> tuple[Finding, ...]:
-    """Findings of the tracking, which does not know the board: a wrong scale also suggests the matching square."""
+    """Findings from the dots, which do not know the board: a wrong scale also suggests the matching square."""
     if recording is None or recording.chessboard is None:
         return tuple(findings)
     square = recording.chessboard.square
@@ -324,20 +322,15 @@ def density(disc: Disc) -> tuple[Finding, ...]:
 
 def balance(trajectory: Trajectory) -> tuple[Array, Array]:
     """Gravity [m/s^2] that satisfies the balance of moments along e1, and energy [J]: (blocks,) in order of time."""
+    rows, length = np.flatnonzero(trajectory.measured), MIN_BLOCKS * BLOCK
+    end = int(rows.max(initial=-1)) + 1
+    starts = range(int(rows.min(initial=end)), end - BLOCK, length)
     found = [(np.empty(0), np.empty(0))]
-    for rows in _stretches(trajectory):
+    for i in evenly(len(starts), STRETCHES):  # evenly distributed over the frames in which the disc was measured
         with suppress(AnalysisError):
-            found.append(_blocks(differentiate(part(trajectory, rows))))
+            found.append(_blocks(differentiate(part(trajectory, slice(starts[i], min(starts[i] + length, end))))))
     gravity, energy = (np.concatenate(of) for of in zip(*found, strict=True))
     return gravity, energy
-
-
-def _stretches(trajectory: Trajectory) -> list[slice]:
-    """Some stretches, evenly distributed over the frames from the first to the last in which the disc was measured."""
-    rows = np.flatnonzero(trajectory.measured)
-    end, length = int(rows.max(initial=-1)) + 1, MIN_BLOCKS * BLOCK
-    starts = range(int(rows.min(initial=end)), end - BLOCK, length)
-    return [slice(start, min(start + length, end)) for start in (starts[i] for i in evenly(len(starts), STRETCHES))]
 
 
 def _blocks(motion: MeasuredMotion) -> tuple[Array, Array]:
@@ -388,8 +381,8 @@ def another_plane(trajectory: Trajectory, boards: Boards | None = None) -> tuple
     rolls = precessed > 2.0 and np.median(e3 @ normal) < np.cos(THETA_RANGE[0])
     if not (rolls and turned > MIN_LEAN and robust_sigma(gap) < SIGMAS * LAB_FRAME):
         return ()
-    lies = None if boards is None else _view_on_plane(trajectory.rig, boards, normal, middle)
-    declared = None if boards is None else boards.table_view
+    boards = boards or Boards({}, None, 0.0)
+    lies, declared = _view_on_plane(trajectory.rig, boards, normal, middle), boards.table_view
     named = "the table view" if declared is None else f"view {declared}"
     does = "" if lies is None else f"; view {lies} does"
     text = (
@@ -448,7 +441,7 @@ def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
     return (Finding(Kind.HANDEDNESS, Severity.DOUBT, text, remedies=remedies),)
 
 
-def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None = None) -> tuple[Finding, ...]:
+def scale_of_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:
     """Ratio of the triangulated distances of the dots to those of their declared centres."""
     rows = np.flatnonzero(trajectory.measured)
     rows = rows[evenly(len(rows), 50)]
@@ -468,7 +461,7 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None =
     typical = _typical(per_pair)
     # pairs share dots: there are only as many independent distances as dots
     scale = replace(typical, sigma=max(typical.sigma * np.sqrt(len(per_pair) / dots), 1e-4))
-    return (other_scale(scale, square),) if _beyond(scale, 1.0, SCALE) else ()
+    return (other_scale(scale),) if _beyond(scale, 1.0, SCALE) else ()
 
 
 def other_scale(scale: Measured, square: float | None = None, explains: tuple[Kind, ...] = BY_SCALE) -> Finding:

@@ -17,17 +17,10 @@ import numpy as np
 from calibration.kit.arguments import checked
 from calibration.kit.arrays import Array, Indices, Mask
 from calibration.kit.brief import Brief
+from disctrack import frames
 from disctrack.analyse.smoothing import HALF_WINDOW_LENGTHS, SEGMENT, fit_process, moving_weights
 from disctrack.disc import Disc
 from disctrack.errors import AnalysisError
-from disctrack.frames import (
-    euler_from_rotation,
-    nodal_axes_world,
-    rotation_from_quaternion,
-    rotation_from_vector,
-    skew,
-    unwrap_euler,
-)
 from disctrack.trajectory import FrameStatus, Trajectory, part
 
 K = np.array([0.0, 0.0, 1.0])
@@ -63,7 +56,7 @@ class MotionState(Brief):
         e3 = self.R_world_body[..., 2]
         s, c = self.sine, e3[:, 2]
         psi = np.where(s > 0, np.arctan2(e3[:, 0], -e3[:, 1]), np.nan)
-        e1, e2, _ = nodal_axes_world(psi, np.arctan2(s, c))
+        e1, e2, _ = frames.nodal_axes_world(psi, np.arctan2(s, c))
         return e1, e2, e3
 
     def displaced(self, step: Array) -> MotionState:
@@ -71,7 +64,7 @@ class MotionState(Brief):
         shift, turn, *changes = step.reshape(6, 3)
         rates = (self.velocity, self.omega_world, self.acceleration, self.alpha_world)
         changed = (rate + change for rate, change in zip(rates, changes, strict=True))
-        return MotionState(self.position + shift, rotation_from_vector(turn) @ self.R_world_body, *changed)
+        return MotionState(self.position + shift, frames.rotation_from_vector(turn) @ self.R_world_body, *changed)
 
 
 @dataclass(frozen=True, repr=False)
@@ -104,22 +97,22 @@ class MeasuredMotion(MotionState):
         """(n,) True if the motion is determined."""
         return np.asarray(np.isfinite(self.omega_world).all(axis=1))
 
-    def shared_covariance(self, frames: Indices) -> Array:
+    def shared_covariance(self, rows: Indices) -> Array:
         """(f, 18, 18) covariance of STATE by the rig, common to all frames, and by other systematic errors."""
-        S = self.calibration_sensitivity[frames]
-        return np.asarray(S @ self.rig_covariance @ S.swapaxes(1, 2) + self.systematic_at(frames))
+        S = self.calibration_sensitivity[rows]
+        return np.asarray(S @ self.rig_covariance @ S.swapaxes(1, 2) + self.systematic_at(rows))
 
-    def systematic_at(self, frames: Indices) -> Array:
+    def systematic_at(self, rows: Indices) -> Array:
         """(f, 18, 18) covariance of STATE by systematic errors, stationary with a squared-exponential covariance.
 
         With their pace w: S of the pose, w^2 S of its rate, 3 w^4 S of its second derivative, -w^2 S between both.
         """
-        S, w2 = self.systematic_covariance[frames], self.systematic_pace**2
-        C = np.zeros((len(frames), N_STATE, N_STATE))
+        S, w2 = self.systematic_covariance[rows], self.systematic_pace**2
+        C = np.zeros((len(rows), N_STATE, N_STATE))
         for first, second, factor in ((0, 0, 1.0), (6, 6, w2), (12, 12, 3 * w2**2), (0, 12, -w2), (12, 0, -w2)):
             C[:, first : first + 6, second : second + 6] = factor * S
         turned = np.broadcast_to(np.eye(N_STATE), C.shape).copy()
-        _rates_of_turned_frame(turned, self.omega_world[frames], self.alpha_world[frames])
+        _rates_of_turned_frame(turned, self.omega_world[rows], self.alpha_world[rows])
         return np.asarray(turned @ C @ turned.swapaxes(1, 2))
 
 
@@ -228,7 +221,7 @@ class _Samples:
         self.ticks = (time - time[0]) / self.interval
         self.good = good
         self.position = np.where(good[:, None], trajectory.q[:, :3], 0.0)
-        self.R = _filled(rotation_from_quaternion(trajectory.quaternion), good, np.nan)
+        self.R = _filled(frames.rotation_from_quaternion(trajectory.quaternion), good, np.nan)
         self.covariance = np.where(good[:, None, None], trajectory.pose_covariance, 0.0)
         # a pose from one camera depends differently on the rig; that jump must not be differentiated
         by_both = good & (trajectory.frame_status == FrameStatus.MEASURED)
@@ -306,7 +299,7 @@ def _smoothed(samples: _Samples, length: Array, amplitude2: Array, rows: Indices
     R = samples.R[rows]
     for _ in range(2):  # the second time relative to the smoothed pose, at which s is the rotation vector
         s, _ = _sine_vectors(samples.R[window], R[:, None])
-        R = rotation_from_vector(np.einsum("kcw,kwc->kc", weights[:, 3:, 0], s)) @ R
+        R = frames.rotation_from_vector(np.einsum("kcw,kwc->kc", weights[:, 3:, 0], s)) @ R
     s, gain = _sine_vectors(samples.R[window], R[:, None])
     noise_window = gain @ samples.covariance[window] @ gain.swapaxes(-1, -2)
     data = np.concatenate([samples.position[window], s], axis=-1)
@@ -331,14 +324,14 @@ def _rates_of_turned_frame(sensitivity: Array, omega_world: Array, alpha_world: 
     omega' = omega + delta' + delta x omega,  alpha' = alpha + delta'' + delta' x omega + delta x alpha.
     """
     turn, rate = sensitivity[:, 3:6].copy(), sensitivity[:, 9:12].copy()
-    omega, alpha = skew(omega_world), skew(alpha_world)
+    omega, alpha = frames.skew(omega_world), frames.skew(alpha_world)
     sensitivity[:, 9:12] -= omega @ turn
     sensitivity[:, 15:18] -= omega @ rate + alpha @ turn
 
 
 def _euler_near(R: Array, reference: Array) -> Array:
     """Unwrapped psi, theta, phi (n, 3) on the branch of the first measured reference angles."""
-    euler = unwrap_euler(euler_from_rotation(R))
+    euler = frames.unwrap_euler(frames.euler_from_rotation(R))
     both = np.flatnonzero(np.isfinite(euler).all(axis=1) & np.isfinite(reference).all(axis=1))
     if both.size:
         turns = np.round((reference[both[0]] - euler[both[0]]) / (2 * np.pi))

@@ -125,9 +125,8 @@ def _pictures(rows: Indices, drawn: Drawn) -> Iterator[dict[str, Any]]:
         picture = drawn(int(rows[k]))
         scale = min(1.0, 300 / picture.shape[0])
         small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        good, coded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 72])
-        if good:
-            yield {"row": k, "uri": f"data:image/jpeg;base64,{base64.b64encode(coded.tobytes()).decode()}"}
+        coded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, 72])[1]
+        yield {"row": k, "uri": f"data:image/jpeg;base64,{base64.b64encode(coded.tobytes()).decode()}"}
 
 
 _STYLE = f"""

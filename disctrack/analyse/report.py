@@ -96,13 +96,15 @@ def _exponents(analysis: Analysis) -> list[Listing | str]:
     laws = analysis.laws
     if not laws.determined:
         return [f"No exponents are given: {laws.reason}."]
-    asymptotic = _largest_nutation(analysis) <= ASYMPTOTIC_BELOW
+    first, last = laws.window
+    to_collapse = laws.t_f - analysis.motion.time
+    theta = analysis.motion.euler[analysis.motion.known & (last <= to_collapse) & (to_collapse <= first), 1]
+    asymptotic = bool(theta.size and theta.max() <= ASYMPTOTIC_BELOW)
     named = ("energy", laws.n_energy, 1.0), ("nutation", laws.n_theta, 1.0), ("precession rate", laws.n_psidot, -0.5)
     rows = [
         (name, _at_95(e), str(e), *(_agreement(e, k * n, asymptotic) for _, n in MODEL_EXPONENTS))
         for name, e, k in named
     ]
-    first, last = laws.window
     said = (
         f"Window: from {first:.3f} s to {last:.3f} s before t_f = {measured(laws.t_f, laws.t_f_sigma)} s (1 σ; "
         f"{laws.n_periods:.1f} nutation periods). 5 ms in t_f would move the exponent of θ by "
@@ -124,14 +126,6 @@ def _agreement(exponent: Exponent, model: float, asymptotic: bool) -> str:
     if exponent.agrees_with(model):
         return f"{model:.3f} yes"
     return f"{model:.3f} no" if asymptotic else f"{model:.3f} as θ → 0"
-
-
-def _largest_nutation(analysis: Analysis) -> float:
-    """Largest nutation in the window of the exponents [rad]."""
-    laws, motion = analysis.laws, analysis.motion
-    to_collapse = laws.t_f - motion.time
-    inside = motion.known & (to_collapse >= min(laws.window)) & (to_collapse <= max(laws.window))
-    return float(motion.euler[inside, 1].max()) if inside.any() else np.inf
 
 
 def _windows_table(fits: Sequence[PowerLaws]) -> Listing:

@@ -43,8 +43,7 @@ def fit_process(segments: Sequence[tuple[Array, Array, Array]], centres: Array, 
         likelihood = _segment_likelihood(_modes(_on_grid(t).tobytes()), data, variance).reshape(len(NOISE_SCALES), -1)
         best[i], where[i] = likelihood.max(axis=1), likelihood.argmax(axis=1)
     scale_index = int(np.argmax(best.sum(axis=0)))
-    flat = where[:, scale_index].astype(int)
-    length_index, ratio_index = np.divmod(flat, len(RATIOS))
+    length_index, ratio_index = np.divmod(where[:, scale_index].astype(int), len(RATIOS))
     variance = np.array([np.mean(v) for _, _, v in segments]) * NOISE_SCALES[scale_index]
     amplitude2 = RATIOS[ratio_index] * variance
     sample = np.arange(n)
@@ -137,12 +136,7 @@ def window_weights(lag: Array, noise_ratio: Array, length: float) -> tuple[Array
 
 
 def moving_weights(
-    times: Array,
-    variance: Array,
-    length: Array,
-    amplitude2: Array,
-    half_window: int,
-    points: Indices,
+    times: Array, variance: Array, length: Array, amplitude2: Array, half_window: int, points: Indices
 ) -> tuple[Array, Array]:
     """Weights (k, 3, 2 half_window + 1) and remaining prior covariance (k, 3, 3) for some samples.
 
