@@ -438,7 +438,10 @@ def _reading(path: Path) -> contextlib.AbstractContextManager[h5py.File]:
 
 
 def _trajectory(file: h5py.File) -> Trajectory:
-    time, disc = _array(file, "time", "s"), _read_disc(file)
+    stored = file["disc"].attrs
+    sizes = {name.rpartition("_")[0]: float(stored[name]) for name in _DISC_SIZES if name in stored}
+    disc = Disc(marker_centres_body=_array(file, "disc/marker_centres_body", "m"), **sizes)
+    time = _array(file, "time", "s")
     lengths = {name: len(values) for name, (values, _) in _NAMED_AXES.items()}
     lengths |= {"time": len(time), "marker": disc.n_markers}
     found: dict[str, Any] = {}
@@ -467,12 +470,6 @@ def _array(file: h5py.File, place: str, unit: str) -> AnyArray:
     if found != unit:
         raise ValueError(f"{place} is in {found!r}; expected {unit!r}")
     return read_array(file[place])
-
-
-def _read_disc(file: h5py.File) -> Disc:
-    stored = file["disc"].attrs
-    sizes = {name.rpartition("_")[0]: float(stored[name]) for name in _DISC_SIZES if name in stored}
-    return Disc(marker_centres_body=_array(file, "disc/marker_centres_body", "m"), **sizes)
 
 
 def _rig(group: h5py.Group) -> StereoRig:

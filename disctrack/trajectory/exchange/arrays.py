@@ -87,10 +87,9 @@ def read_opencv(
 
 def _nodes(path: Path) -> dict[str, Any]:
     """Entries of a file that belong to a rig. Raises RigFileError."""
-    text = content_of(path)
     found: dict[str, Any] = {}
     with told_as(RigFileError, f"{path}: not a stereo rig in OpenCV's YAML, XML or JSON format", Exception):
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        storage = cv2.FileStorage(content_of(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         for name in (*_YAML, *_BESIDE):
             matrix = storage.getNode(name).mat()
             if matrix is not None:

@@ -30,8 +30,7 @@ def body_points(trajectory: Trajectory) -> tuple[Array, list[str]]:
 
 def rotations(trajectory: Trajectory) -> Array:
     """R_world_body (n, 3, 3); NaN in frames without a pose."""
-    R = rotation_from_quaternion(trajectory.quaternion)
-    return np.where(trajectory.measured[:, None, None], R, np.nan)
+    return np.where(trajectory.measured[:, None, None], rotation_from_quaternion(trajectory.quaternion), np.nan)
 
 
 def place_sigma_mm(trajectory: Trajectory) -> Array:

@@ -15,14 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calibration.cameras.camera import (
-    INTRINSIC_PARAMETERS,
-    Camera,
-    StereoRig,
-    normalise,
-    placed_at,
-    project_with_jacobians,
-)
+from calibration.cameras.camera import Camera, StereoRig, normalise, placed_at, project_with_jacobians
 from calibration.kit.arrays import Array
 from disctrack.errors import OutputError, RigFileError, told_as
 from disctrack.files.inputs import read_regular
@@ -312,7 +305,7 @@ def within_brown(rig: StereoRig, terms: tuple[str, ...]) -> tuple[StereoRig, str
 def _refitted(rig: StereoRig, number: int, terms: tuple[str, ...]) -> tuple[Camera, Array]:
     """The fitted camera, and the shifts (n, 2) [px] of the images of rays."""
     camera, field = rig.cameras[number], rig.lens_field
-    free = np.array([name not in BROWN or name in terms for name in INTRINSIC_PARAMETERS])
+    free = np.array([True] * 4 + [name in terms for name in BROWN])  # fx, fy, cx, cy are
     x, y = (np.linspace(0, size - 1, 40) for size in camera.image_size)
     seen = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     flat = normalise(seen if field is None else seen - field.displacement(seen, number), camera)
