@@ -130,10 +130,8 @@ def restored(kept: Mapping[str, Any], data: Mapping[str, Any]) -> Report:
     return Report(*head, findings, files=files, page=page, then=kept["next"], data={**kept, **data})
 
 
-def _cell(cell: Cell) -> Any:
-    if isinstance(cell, Measured):
-        return {"value": cell.value, "sigma": cell.sigma, "unit": cell.unit}
-    return "" if isinstance(cell, Markup) else str(cell)
+def _cell(cell: Cell) -> Cell:
+    return "" if isinstance(cell, Markup) else cell
 
 
 def _block(block: Block) -> dict[str, Any]:

@@ -60,8 +60,7 @@ def link_pages(pages: Mapping[str, Path]) -> None:
     """Write links to the other pages into each existing page. pages : title -> file"""
     existing = {name: path for name, path in pages.items() if path.is_file()}
     for own in (path for path in existing.values() if path.suffix == ".html"):
-        content = own.read_text(encoding="utf-8")
-        before, start, rest = content.partition(NAV[0])
+        before, start, rest = own.read_text(encoding="utf-8").partition(NAV[0])
         _, end, after = rest.partition(NAV[1])
         links = "".join(
             f'<a href="{quote(seen_from(own.parent, path).as_posix())}">{escape(name)}</a>'
