@@ -58,8 +58,13 @@ def poses_with(trajectory: Trajectory, values: Values) -> Trajectory:
     angles = np.full((len(trajectory), 3), np.nan)
     angles[fits.converged] = unwrap_euler(euler_from_rotation(fits.R_world_body[fits.converged]))
     q = np.column_stack([fits.t_world_body, angles])
-    posed = replace(trajectory, q=q, pose_covariance=fits.covariance)
-    return replace(posed, markers_residual_px=fits.residuals_px, reduced_chi_square=fits.reduced_chi_square)
+    return replace(
+        trajectory,
+        q=q,
+        pose_covariance=fits.covariance,
+        markers_residual_px=fits.residuals_px,
+        reduced_chi_square=fits.reduced_chi_square,
+    )
 
 
 def large_faults(as_tracked: Trajectory, system: DiscSystem, first: Systematic) -> tuple[DiscSystem, Former] | None:

@@ -170,6 +170,15 @@ def in_common(members: Sequence[tuple[Mapping[str, str], Systematic, list[Array]
         dots = max((s for s, _ in rigs), key=lambda s: s.dot_px)
         places = tuple(np.concatenate([p[c] for _, p in rigs]) for c in range(2))
         print_m = max(s.print_m for of, s, _ in members if of["disc"] == labels["disc"])
-        mine = replace(mine, lens_px=lens.lens_px, lens_length_px=lens.lens_length_px, lens_places=places)
-        common.append(replace(mine, dot_px=dots.dot_px, dot_length_px=dots.dot_length_px, print_m=print_m))
+        common.append(
+            replace(
+                mine,
+                lens_px=lens.lens_px,
+                lens_length_px=lens.lens_length_px,
+                lens_places=places,
+                dot_px=dots.dot_px,
+                dot_length_px=dots.dot_length_px,
+                print_m=print_m,
+            )
+        )
     return common
