@@ -1,14 +1,13 @@
 """Test of the claimed accuracy of 0.005 mm and 0.05 deg: the numbers, and a sentence that follows from them."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
 from calibration.kit.arrays import Array
 from disctrack.analyse.declaration import CLAIM_POSITION
 from disctrack.frames import COORDINATES, POSE_COMPONENTS
-from disctrack.validate.errors import PoseErrors, calibration_consistency, joined, noise_consistency
-from disctrack.validate.rendered import EXPOSURE, STATIC, STRATA_DEG, RenderedOutcome
+from disctrack.validate.rendered import EXPOSURE, STATIC, STRATA_DEG, PoseErrors, RenderedOutcome, joined
 from disctrack.validate.tables import Validation, grouped, table
 
 PER_SI = {"µm": 1e6, "mdeg": 180e3 / np.pi}
@@ -66,6 +65,34 @@ def _size(some: PoseErrors) -> Row:
     counts = {"poses": len(some.q), "found": int(found), "wrong": int(wrong)}
     units = {"position": "µm", **dict.fromkeys(("rotation", "theta", "psi", "phi"), "mdeg")}
     return counts | {f"{name} [{unit}]": PER_SI[unit] * _rms(some.of(name)) for name, unit in units.items()}
+
+
+def squared(error: Array, covariance: Array) -> Array:
+    """(n,) e^T C^-1 e / 6 of errors (n, 6), on average 1 with the correct covariance C (n, 6, 6)."""
+    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0]) / 6
+
+
+def consistency(values: Sequence[float] | Array) -> dict[str, float]:
+    """Mean of `squared` over poses or rigs, and its standard error if the reported covariance is correct."""
+    n = len(values)
+    value = float(np.mean(values)) if n else float("nan")
+    return {"value": value, "standard error": float(np.sqrt(2 / (6 * max(n, 1)))), "poses or rigs": n}
+
+
+def noise_consistency(errors: PoseErrors) -> dict[str, float]:
+    """Squared error over the reported variance of the noise; the errors must be free of calibration errors."""
+    return consistency(squared(errors.error, errors.covariance)[errors.usable])
+
+
+def calibration_consistency(pairs: Iterable[tuple[PoseErrors, PoseErrors]]) -> dict[str, float]:
+    """Squared calibration error over its reported variance, from the same images measured with two rigs.
+
+    pairs : poses of each recording with its own calibration and with the true cameras. Both have the same image noise,
+    so their difference is the calibration error alone. It is common to a recording, which therefore counts once, with
+    the mean over its poses.
+    """
+    of_rigs = (squared(a.error - b.error, a.calibration_covariance)[a.usable & b.usable] for a, b in pairs)
+    return consistency([float(values.mean()) for values in of_rigs if len(values)])
 
 
 def verdict(accuracy: Accuracy) -> str:

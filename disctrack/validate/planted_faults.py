@@ -35,8 +35,7 @@ from disctrack.synthetic.description import CameraSettings, Scene
 from disctrack.synthetic.recording import run_render
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.file import read_trajectory
-from disctrack.validate.errors import compare
-from disctrack.validate.rendered import reordered, rolling_scene, scene_of
+from disctrack.validate.rendered import compare, reordered, rolling_scene, scene_of
 from disctrack.validate.tables import Validation, grouped, table
 
 PAIRS = 100  # the minimum for a test of gravity and frame rate

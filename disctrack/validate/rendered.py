@@ -4,6 +4,8 @@ A case is a named scene, with its faults, imperfections and light in all images.
 the recording are those of any user's recording. A comparison uses only the truth and the reported numbers.
 """
 
+from __future__ import annotations
+
 import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -14,20 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arrays import AnyArray, Array
+from calibration.kit.arrays import AnyArray, Array, Mask
 from disctrack.calibrate.stage import calibrate_recording
 from disctrack.disc import Disc
 from disctrack.errors import SceneError
 from disctrack.findings import Kind
-from disctrack.frames import CAMERAS, rotation_from_euler
+from disctrack.frames import CAMERAS, COORDINATES, rotation_from_euler, rotation_from_quaternion, vector_from_rotation
 from disctrack.recording.declaration import read_recording
 from disctrack.synthetic.cameras import all_inside, rig_of
 from disctrack.synthetic.description import GlareSettings, Scene
 from disctrack.synthetic.recording import Truth, run_render
 from disctrack.track.measurement import measure, open_pairs
 from disctrack.track.pose import MIN_DOTS
-from disctrack.trajectory import part
-from disctrack.validate.errors import PoseErrors, compare
+from disctrack.trajectory import Trajectory, part
 from disctrack.validate.points import LABORATORY
 
 STATIC = "static poses"
@@ -42,6 +43,69 @@ STRATA_DEG = ((0.5, 1.0), (1.0, 2.0), (2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20
 FIELD_RADIUS = 25e-3  # [m] largest distance of the disc from the middle of the field, with all dots in both images
 BORDER_PX = 14  # for the window around a dot
 SMALLEST_SEMI_MINOR_PX = 3.2  # below, the blurred centre of a dot is not black
+
+GROSS = (0.5e-3, np.radians(1.0))  # [m, rad] of position and rotation, above which a pose is wrong, not inaccurate
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Differences measured - true of n poses; NaN without a measured pose."""
+
+    q: Array  # (n, 6) true
+    error: Array  # (n, 6) POSE_COMPONENTS [m, rad]: position, rotation vector in world axes
+    angles: Array  # (n, 3) psi, theta, phi [rad], in (-pi, pi]
+    covariance: Array  # (n, 6, 6) reported, of the noise
+    calibration_covariance: Array  # (n, 6, 6) reported, of the calibration
+
+    @property
+    def found(self) -> Mask:
+        """(n,) True if a pose is reported."""
+        return np.asarray(np.isfinite(self.error).all(axis=1))
+
+    @property
+    def usable(self) -> Mask:
+        """(n,) True if a pose is reported that is not wrong."""
+        sizes = np.linalg.norm(self.error.reshape(-1, 2, 3), axis=2)
+        return np.asarray((sizes <= GROSS).all(axis=1))
+
+    def of(self, quantity: str) -> Array:
+        """Errors of a coordinate (n,), or of "position" or "rotation" about all axes (3 n,) [m, rad], of usable poses.
+
+        rotation : the rotation vector between measured and true attitude
+        """
+        columns = dict(zip(COORDINATES, (*self.error.T[:3], *self.angles.T), strict=True))
+        columns |= {"position": self.error[:, :3], "rotation": self.error[:, 3:]}
+        return columns[quantity][self.usable].ravel()
+
+    def mean(self) -> tuple[Array, Array]:
+        """Mean error (6,) of the usable poses, and the stated uncertainty of their common error (6,)."""
+        usable = self.part(self.usable)
+        variance = np.median(np.diagonal(usable.calibration_covariance, axis1=1, axis2=2), axis=0)
+        return usable.error.mean(axis=0), np.sqrt(variance)
+
+    def frame_to_frame(self) -> float:
+        """Variance of the errors from their second differences, over the stated variance of the noise of a frame."""
+        usable = self.part(self.usable)
+        variances = np.diff(usable.error, 2, axis=0) ** 2 / 6.0
+        return float(np.mean(variances / np.diagonal(usable.covariance, axis1=1, axis2=2)[1:-1]))
+
+    def part(self, rows: Mask) -> PoseErrors:
+        """The poses of these rows (n,)."""
+        return PoseErrors(*(values[rows] for values in vars(self).values()))
+
+
+def compare(trajectory: Trajectory, q_true: Array) -> PoseErrors:
+    """Comparison of a trajectory with the true poses (n, 6) of its frames."""
+    R = rotation_from_euler(*q_true[:, 3:].T)
+    turn = rotation_from_quaternion(trajectory.quaternion) @ np.swapaxes(R, 1, 2)
+    error = np.concatenate([trajectory.q[:, :3] - q_true[:, :3], vector_from_rotation(turn)], axis=1)
+    angles = np.angle(np.exp(1j * (trajectory.q[:, 3:] - q_true[:, 3:])))
+    return PoseErrors(q_true, error, angles, trajectory.pose_covariance, trajectory.calibration_covariance)
+
+
+def joined(parts: Iterable[PoseErrors]) -> PoseErrors:
+    """All poses of several comparisons."""
+    return PoseErrors(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 @dataclass(frozen=True)

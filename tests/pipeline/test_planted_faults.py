@@ -20,7 +20,7 @@ from disctrack.synthetic.description import Scene
 from disctrack.track.judge.disc_not_seen import arrangement_found, moved_camera, unlike_declared
 from disctrack.track.refine.assembly import TrackingSettings
 from disctrack.track.refine.scatter import MIN_FRAMES
-from disctrack.validate.errors import compare
+from disctrack.validate.rendered import compare
 from tests.disctrack.recording.readers.written import write_video
 from tests.oracles.planted_faults import FAULTS, glare
 from tests.pipeline.conftest import images_of

@@ -20,7 +20,7 @@ from disctrack.track.follow.tracking import Taken, _as_one_sensor, stretch_edges
 from disctrack.track.measurement import refuse_unreadable
 from disctrack.track.pose import DotsInFrames
 from disctrack.track.refine.assembly import fit_all
-from disctrack.validate.errors import compare
+from disctrack.validate.rendered import compare
 from tests.oracles.point_laboratory import tables_of
 from tests.rendering import expected_disc, rolling_disc
 

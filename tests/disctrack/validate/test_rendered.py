@@ -13,9 +13,8 @@ from disctrack.synthetic.cameras import rig_of
 from disctrack.track.dots.template import NoiseModel
 from disctrack.track.measurement import measure, open_pairs
 from disctrack.trajectory import part
+from disctrack.validate import accuracy as summary
 from disctrack.validate import rendered
-from disctrack.validate.accuracy import Accuracy, accuracy_validation, complaints, imperfect_validation, verdict
-from disctrack.validate.errors import compare, joined, noise_consistency
 from disctrack.validate.tables import write_validation
 
 GOAL_HEIGHT, GOAL_TILT = 5e-6, np.radians(5e-3)  # [m, rad] of the mean error in an imperfect laboratory
@@ -29,14 +28,14 @@ def outcomes():
 
 @pytest.fixture(scope="module")
 def accuracy(outcomes):
-    return Accuracy(outcomes)
+    return summary.Accuracy(outcomes)
 
 
 @pytest.mark.statistical
 def test_own_calibration_keeps_the_papers_claim_and_finds_every_pose_without_a_prior(accuracy):
     """With a quarter of the paper's pixels; for all but psi and phi, which 1/sin(theta) spoils."""
     assert set(accuracy.rows) == {rendered.STATIC, rendered.ROLLING, rendered.FINAL}
-    assert not list(complaints(accuracy))
+    assert not list(summary.complaints(accuracy))
     two, one, none, *_ = accuracy.sights.values()
     assert (two["found"], two["wrong"]) == (two["poses"], 0)
     assert two["poses"] > 10
@@ -47,7 +46,7 @@ def test_own_calibration_keeps_the_papers_claim_and_finds_every_pose_without_a_p
 @pytest.mark.statistical
 def test_covariances_are_honest(outcomes, accuracy):
     """Of 50 poses through the true cameras chance allows 1 +- 0.08; one rig has six degrees of freedom."""
-    pooled = noise_consistency(joined(outcome.seen_by_both[1] for outcome in outcomes))
+    pooled = summary.noise_consistency(rendered.joined(outcome.seen_by_both[1] for outcome in outcomes))
     assert abs(pooled["value"] - 1) < 4 * pooled["standard error"]
     # chi-square / 6 exceeds 3.7 once in a thousand rigs
     assert next(c for name, c in accuracy.consistency.items() if name.startswith("calibration"))["value"] < 3.7
@@ -58,17 +57,17 @@ def test_a_biased_calibration_turns_the_verdict(outcomes):
     """Negative control of the summary: 20 um added to the measured heights."""
     static = outcomes[0]
     raised = replace(static.own, error=static.own.error + np.array([0, 0, 20e-6, 0, 0, 0]))
-    wrong = Accuracy([replace(static, own=raised)])
-    assert "holds in part" in verdict(wrong)
-    assert any("95 % of z" in line for line in complaints(wrong))
-    assert any(line.startswith("calibration") and "squared error" in line for line in complaints(wrong))
+    wrong = summary.Accuracy([replace(static, own=raised)])
+    assert "holds in part" in summary.verdict(wrong)
+    assert any("95 % of z" in line for line in summary.complaints(wrong))
+    assert any(line.startswith("calibration") and "squared error" in line for line in summary.complaints(wrong))
 
 
 @pytest.mark.statistical
 def test_a_camera_turned_since_the_calibration_is_noticed_by_the_measurement_and_by_the_truth():
     turned = Faults(left=CameraFault(rotation_deg=(0.0, np.degrees(1e-3), 0.0)))
     static, *_ = rendered.ideal_cases(replace(rendered.scene_of(2014, quick=True), faults=turned), 24, 1)
-    found = accuracy_validation([rendered.render_and_measure(static)])
+    found = summary.accuracy_validation([rendered.render_and_measure(static)])
     assert "does not hold" in found.headline or "holds in part" in found.headline
     assert found.complaints
     assert found.remarks
@@ -76,7 +75,7 @@ def test_a_camera_turned_since_the_calibration_is_noticed_by_the_measurement_and
 
 @pytest.mark.statistical
 def test_files_are_whole_and_a_page_keeps_what_stands_around_the_tables(outcomes, tmp_path):
-    validation = accuracy_validation(outcomes)
+    validation = summary.accuracy_validation(outcomes)
     page = tmp_path / "accuracy.md"
     marked = "<!-- validation: validation -->\nformer table\n<!-- end of validation -->"
     page.write_text(f"# Accuracy\n\n{marked}\n\nLast words.\n")
@@ -98,7 +97,7 @@ def test_command_prints_the_verdict_and_tells_of_failed_checks(outcomes, tmp_pat
     """The measurement itself is that of the other tests."""
     command = "validate", "--quick", "-o", tmp_path / "out"
     monkeypatch.setattr("disctrack.commands.validate.measure_all", lambda *_: outcomes)
-    assert cli(*command).out.startswith(verdict(Accuracy(outcomes)))
+    assert cli(*command).out.startswith(summary.verdict(summary.Accuracy(outcomes)))
     static, *rolling = outcomes
     late = np.arange(len(static.own.q))[:, None] > 2
     lost = replace(static.own, error=np.where(late, static.own.error, np.nan))
@@ -151,10 +150,10 @@ def test_noisy_sensors_and_more_bits_are_measured_from_the_first_pair_on(bits, r
     sensor = {"read_noise_dn": read_noise}
     scene = rendered.scene_of(2, quick=True).changed(cameras={"bit_depth": bits}, sensor=sensor)
     tracking, truth = located(seen_by_both(3, scene, rng), tmp_path)
-    found = compare(part(tracking.trajectory, slice(None, None, 2)), truth.q)
+    found = rendered.compare(part(tracking.trajectory, slice(None, None, 2)), truth.q)
     assert found.usable.all()
     # on 40 numbers chance allows 1 +- 0.33
-    assert 0.3 < noise_consistency(found)["value"] < 2.0
+    assert 0.3 < summary.noise_consistency(found)["value"] < 2.0
     grey = (2**bits - 1) / 255
     variance = NoiseModel(**tracking.details["noise"][0]).variance(100 * grey)
     assert variance == pytest.approx((read_noise**2 + 100 / 50) * grey**2, rel=0.35)  # 12 flat parts, 100 pixels each
@@ -164,7 +163,7 @@ def test_noisy_sensors_and_more_bits_are_measured_from_the_first_pair_on(bits, r
 def test_height_and_tilt_in_an_imperfect_laboratory_and_what_is_stated_of_them():
     cases = [rendered.imperfect_case(rendered.scene_of(seed, quick=True), 60) for seed in (31, 32)]
     outcomes = [rendered.render_and_measure(case) for case in cases]
-    assert imperfect_validation(outcomes).markdown().count("+-") == 13
+    assert summary.imperfect_validation(outcomes).markdown().count("+-") == 13
     pulls = []
     for outcome in outcomes:
         mean, sigma = outcome.own.mean()
