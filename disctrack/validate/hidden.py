@@ -192,10 +192,9 @@ def _expected_significance(result: DiscDiagnosis, truths: Sequence[Values], plan
         return np.nan, np.nan
     found = []
     for truth, candidate in zip(truths, own, strict=True):
-        index = [joint.names.index(n) for n in candidate.names]
         amount = np.array([truth.get(q.name, q.null) - q.null for q in candidate.quantities])
-        sigmas = np.sqrt(wald(amount, joint.covariance[np.ix_(index, index)]) / d.noise)
-        found.append((float(sigmas), float(np.sqrt(threshold(system, d.settings, len(index))))))
+        sigmas = np.sqrt(wald(amount, joint.amounts(candidate.names)[1]) / d.noise)
+        found.append((float(sigmas), float(np.sqrt(threshold(system, d.settings, len(amount))))))
     return min(found, key=lambda one: one[0] / one[1])
 
 

@@ -131,12 +131,11 @@ def _with_bent_board(scene: Scene, rng: np.random.Generator) -> Scene:
     height, scale, *tilts = rng.standard_normal(4)
     settings, f = scene.imperfections, scene.faults
     lifted, *turned = settings.board_bow_mm * TABLE_BY_BOW * [height, *tilts]
-    changed = {
+    return scene.changed(faults={
         "table_height_mm": f.table_height_mm + lifted,
         "table_turn_deg": tuple(f.table_turn_deg + np.degrees(1e-3 * np.array(turned))),
         "pattern_scale": f.pattern_scale + settings.board_stretch / 2 * scale,  # of two sides one is stretched
-    }
-    return scene.changed(faults=changed)
+    })  # fmt: skip
 
 
 def _shifted_dots(rng: np.random.Generator, pixels: Array, scene: Scene) -> Array:

@@ -73,24 +73,22 @@ def measure_all(measure: Callable[[Case], Outcome], cases: Sequence[Case], jobs:
 
 
 def write_validation(folder: Path, validation: Validation, command: str, page: Path | None = None) -> list[Path]:
-    """Write NAME.json, NAME.md and, if given, the section of a page; returns the files. Raises OutputError."""
+    """Write NAME.json, NAME.md and, if given, the section of a page; returns the files. Raises OutputError.
+
+    A section, with date, version and command, is between the marks of this validation, or at the page's end.
+    """
     numbers = folder / f"{validation.name}.json"
     tree = {"units": "SI, radians unless named", "headline": validation.headline, "complaints": validation.complaints}
     write_whole(numbers, json_file(tree | {"outcomes": [vars(outcome) for outcome in validation.outcomes]}))
+    begin, end = f"<!-- validation: {validation.name} -->", f"<!-- end of {validation.name} -->"
+    source = f"Written by `{command}`, disctrack {__version__}, {date.today().isoformat()}."
     pages = [folder / f"{validation.name}.md", *([page] if page else [])]
     for file in pages:
-        _write_section(file, validation, command)
+        text = file.read_text(encoding="utf-8") if file.exists() else ""
+        before, begun, rest = text.partition(begin)
+        _, ended, after = rest.partition(end)
+        if begun and not ended:
+            raise OutputError(f"{file}: '{begin}' without '{end}' below; expected both, or neither for a new section")
+        content = f"{before}{begin}\n{validation.markdown()}\n{source}\n{end}{after or chr(10)}"
+        write_whole(file, content.encode())
     return [numbers, *pages]
-
-
-def _write_section(page: Path, validation: Validation, command: str) -> None:
-    """Write a section, with date, version and command, between the marks of this validation, or at the page's end."""
-    begin, end = f"<!-- validation: {validation.name} -->", f"<!-- end of {validation.name} -->"
-    text = page.read_text(encoding="utf-8") if page.exists() else ""
-    before, begun, rest = text.partition(begin)
-    _, ended, after = rest.partition(end)
-    if begun and not ended:
-        raise OutputError(f"{page}: '{begin}' without '{end}' below; expected both, or neither for a new section")
-    source = f"Written by `{command}`, disctrack {__version__}, {date.today().isoformat()}."
-    content = f"{before}{begin}\n{validation.markdown()}\n{source}\n{end}{after or chr(10)}"
-    write_whole(page, content.encode())
