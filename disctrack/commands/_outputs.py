@@ -17,7 +17,6 @@ from disctrack.findings import Kind, Severity, in_doubt, leading, of_kind
 from disctrack.progress import progress_bar
 from disctrack.recording.declaration import FILE_NAME, Recording
 from disctrack.recording.declaration_text import changed_since
-from disctrack.recording.readers.blocks import iter_pair_blocks
 from disctrack.report.blocks import Facts, Report, document
 from disctrack.report.html import link_pages
 from disctrack.report.terminal import show
@@ -156,7 +155,7 @@ def _companions(
 
 def pair_of(pairs: ImagePairs, row: int) -> AnyArray:
     """Both images of a frame (2, height, width); one that cannot be read is black."""
-    (block,) = iter_pair_blocks(pairs.left, pairs.right, row, row + 1)
+    (block,) = pairs.reading({})(row, row + 1)
     return block.images[0]
 
 

@@ -2,7 +2,6 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from calibration import Board, BoardTolerances
 from disctrack.calibrate.stage import CalibrationSource, calibrate_into, source_of
@@ -17,11 +16,12 @@ TABLE = ("--table-view", "--board-thickness-mm")
 
 def run(arguments: argparse.Namespace) -> int:
     """Calibrate; returns the exit code."""
+    given = [name for name in VIEWS + TABLE if getattr(arguments, name[2:].replace("-", "_")) is not None]
     if arguments.recording is None:
-        source = _source_of_patterns(arguments)
+        source = _source_of_patterns(arguments, given)
         path = arguments.output or Path("rig.h5")
     else:
-        if given := [option for option in VIEWS + TABLE if _given(arguments, option) is not None]:
+        if given:
             raise RecordingError(
                 f"{', '.join(given)}: a recording's own recording.toml says this. Change it there, or give no folder."
             )
@@ -32,10 +32,9 @@ def run(arguments: argparse.Namespace) -> int:
     return outputs.finish(report, arguments, path.parent)
 
 
-def _source_of_patterns(arguments: argparse.Namespace) -> CalibrationSource:
-    """Views named on the command line. Raises RecordingError."""
-    missing = [option for option in VIEWS if _given(arguments, option) is None]
-    if missing:
+def _source_of_patterns(arguments: argparse.Namespace, given: list[str]) -> CalibrationSource:
+    """Views named on the command line by the options `given`. Raises RecordingError."""
+    if missing := [name for name in VIEWS if name not in given]:
         raise RecordingError(f"{', '.join(missing)} missing: give a recording's folder, or all of {', '.join(VIEWS)}.")
     return CalibrationSource(
         arguments.left,
@@ -45,7 +44,3 @@ def _source_of_patterns(arguments: argparse.Namespace) -> CalibrationSource:
         (arguments.board_thickness_mm or 0.0) * 1e-3,
         BoardTolerances(),
     )
-
-
-def _given(arguments: argparse.Namespace, option: str) -> Any:
-    return getattr(arguments, option[2:].replace("-", "_"))
