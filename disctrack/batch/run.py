@@ -155,9 +155,8 @@ def _summed_up(
     problems = [f"not searched: {problem}" for problem in found.problems]
     said = ""
     if options.together and processes and not interrupted:
-        measured = rows_of(found, records)
         try:
-            said = diagnose_all(found.common, measured, processes)
+            said = diagnose_all(found.common, rows_of(found, records), processes)
         except AnalysisError as error:
             problems.append(f"together: {error}")
         except KeyboardInterrupt:  # the summary is written nevertheless
