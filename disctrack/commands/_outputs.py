@@ -43,8 +43,7 @@ def track_into(
 
     def measured() -> tuple[Trajectory, Details]:
         with progress_bar("track", len(pairs), "pair") as advance:
-            boards = boards_in(rig_file, recording)
-            found = measure(recording, rig, pairs, settings, arguments.threads, advance, boards)
+            found = measure(recording, rig, pairs, settings, arguments.threads, advance, boards_in(rig_file, recording))
         speed = len(pairs) / max(found.seconds, 1e-9)
         rows.append(("speed", f"{speed:.0f} pairs/s ({found.seconds:.2f} s with reading the images)"))
         return found.trajectory, found.details

@@ -31,14 +31,10 @@ def run(arguments: argparse.Namespace) -> int:
     requested = [page, *([folder / "figures"] if arguments.figures else [])]
     if known is not None and not arguments.overwrite and all(place.exists() for place in requested):
         return outputs.finish(known, arguments, folder, reused=True)
+    again = arguments.overwrite or known is not None
     with steps("analyse"):
         outcome = run_analyse(
-            path,
-            folder,
-            window=arguments.window,
-            circle_duration=arguments.circle,
-            overwrite=arguments.overwrite or known is not None,
-            figures=arguments.figures,
+            path, folder, arguments.window, arguments.circle, overwrite=again, figures=arguments.figures
         )
     with steps("motion.html"):
         _write_motion_page(page, outcome.analysis, path, arguments.recording)

@@ -39,14 +39,10 @@ def run(arguments: argparse.Namespace) -> int:
         return outputs.finish(Report("", said, findings=findings, then=then), arguments, folder)
     with compiling("the simulation of motions", 30):
         rolling.prepare()
+    again = arguments.overwrite or known is not None
     with steps("diagnose"):
         outcome = run_diagnose(
-            path,
-            folder,
-            model=arguments.model,
-            overwrite=arguments.overwrite or known is not None,
-            settle=arguments.plan,
-            figures=arguments.figures,
+            path, folder, model=arguments.model, overwrite=again, settle=arguments.plan, figures=arguments.figures
         )
     outputs.link_pages_of(path)
     return outputs.finish(outcome.summary, arguments, folder)
@@ -71,9 +67,6 @@ def _together(paths: list[Path], arguments: argparse.Namespace) -> int:
             progress=step,
         )
     code = outputs.finish(report, arguments, report.files[0].parent)
-    if unusable := report.data["unusable"]:
-        print(
-            f"disctrack: {len(unusable)} recording{'s' * (len(unusable) > 1)} could not be used (see above).",
-            file=sys.stderr,
-        )
+    if unusable := len(report.data["unusable"]):
+        print(f"disctrack: {unusable} recording{'s' * (unusable > 1)} could not be used (see above).", file=sys.stderr)
     return INCOMPLETE if unusable else code

@@ -230,8 +230,7 @@ def add_convert(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cameras", nargs=2, metavar=("LEFT", "RIGHT"), help=what)
     what = "[px] where an OpenCV file does not state it"
     parser.add_argument("--image-size", type=_positive, nargs=2, metavar=("WIDTH", "HEIGHT"), help=what)
-    what = "length of an OpenCV file's unit, where it does not state it"
-    _value(parser, "--unit-mm UNIT_MM", _positive_number, what)
+    _value(parser, "--unit-mm UNIT_MM", _positive_number, "length of an OpenCV file's unit, where it does not state it")
     _flag(parser, "--overwrite", "replace the target")
 
 

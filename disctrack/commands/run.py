@@ -23,13 +23,11 @@ def run(arguments: argparse.Namespace) -> int:
     for path in (folder / "trajectory.h5", summary):
         refuse_input(path)
     outputs.check_writable(folder)
+    rig_file = recording.rig_file or folder / "rig.h5"
     if recording.rig_file is not None:
-        rig_file = recording.rig_file
         rig, known = given_rig(rig_file)
     else:
-        rig_file = folder / "rig.h5"
-        source = source_of(recording)
-        rig, known = calibrate_into(rig_file, source, arguments.overwrite, not arguments.no_figures)
+        rig, known = calibrate_into(rig_file, source_of(recording), arguments.overwrite, not arguments.no_figures)
     verdict = f"Calibration: {known.verdict}"
     if recording.rig_file is None and not arguments.quiet:  # before the frames, which take longer
         print(verdict, file=sys.stderr, flush=True)

@@ -2,10 +2,10 @@
 
 import argparse
 
-from calibration.rig_file import read_rig
+from disctrack.calibrate.stage import given_rig
 from disctrack.commands import _outputs as outputs
 from disctrack.errors import RecordingError
-from disctrack.files.inputs import keep, refuse_input
+from disctrack.files.inputs import refuse_input
 from disctrack.recording.declaration import read_recording
 from disctrack.track import measurement as pipeline
 
@@ -20,8 +20,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"{rig_file}: no such rig file. Calibrate first (disctrack calibrate {arguments.recording} -o rig.h5), "
             "or name the rig with --rig."
         )
-    keep(rig_file)
-    rig = read_rig(rig_file)
+    rig, _ = given_rig(rig_file)
     pairs = pipeline.open_pairs(recording, arguments.frames or (None, None))
     refuse_input(path)
     outputs.check_writable(path.parent)
