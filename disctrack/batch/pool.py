@@ -88,7 +88,7 @@ class Processes:
         self._context = Spawn()
         self._ends = False
         self._folder = tempfile.TemporaryDirectory(prefix="disctrack-")
-        self._said = (Path(self._folder.name) / str(i) for i in itertools.count())
+        self._numbers = itertools.count()  # of files for what processes print
 
     def submit(self, job: Job) -> Future[Row]:
         """Submit a job; its future raises OSError if no process can be started."""
@@ -110,7 +110,7 @@ class Processes:
 
     def _begun(self) -> tuple[SpawnProcess, Connection, Path]:
         """A new process, the connection for jobs, and the file for its printed output. Raises OSError."""
-        (jobs, its_end), said = self._context.Pipe(), next(self._said)
+        (jobs, its_end), said = self._context.Pipe(), Path(self._folder.name, str(next(self._numbers)))
         process = self._context.Process(target=_work, args=(its_end, said))
         process.start()
         its_end.close()  # so that the connection closes when the process ends, which ends `recv`
