@@ -4,8 +4,6 @@ As tables 2 and 3 of Ma et al. (2014); in addition, the spread is compared with 
 """
 
 from collections.abc import Sequence
-from itertools import groupby
-from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -127,11 +125,11 @@ def group_of(recording: Recording) -> str:
 
 def repeats_of(rows: Sequence[Row]) -> list[Row]:
     """Rows of REPEATS, one for each number that two or more recordings of a group determine."""
-    different = {row["input_sha256"]: row for row in reversed(rows) if row["repeats"]}  # the first of each input
-    group_in = itemgetter("repeats")
+    # the first of each input
+    different = {row["input_sha256"]: row for row in reversed(rows) if row["repeats"]}.values()
     found = []
-    for group, alike in groupby(sorted(different.values(), key=group_in), key=group_in):
-        members = list(alike)
+    for group in sorted({row["repeats"] for row in different}):
+        members = [row for row in different if row["repeats"] == group]
         for fitted in (fitted for fitted in FITTED if fitted.repeated):
             known = [row for row in members if row[fitted.column] is not None and row[fitted.sigma]]
             found += [_spread(group, fitted, known)] if len(known) > 1 else []

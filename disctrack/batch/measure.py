@@ -113,9 +113,8 @@ def _after_tracking(path: Path, trajectory: Trajectory, job: Job) -> Row:
         missing.append(f"not analysed: {reason_of(error)}")
     row |= friction_numbers(trajectory)
     if job.options.diagnose:
-        wrong = wrong_declarations(trajectory.findings)
         try:
-            if wrong:
+            if wrong_declarations(trajectory.findings):
                 raise AnalysisError("a number is declared wrong, and a missing effect would be read into it")
             diagnosed = run_diagnose(path, overwrite=True).summary
             row |= {
@@ -135,7 +134,7 @@ def tracked_numbers(trajectory: Trajectory) -> Row:
     numbers: Row = {
         "pairs": int(looked_for.sum()),
         "pairs_measured": int(trajectory.measured.sum()),
-        "duration_s": np.ptp(trajectory.time[looked_for]) if looked_for.any() else None,
+        "duration_s": np.ptp(trajectory.time[looked_for]),
         "reduced_chi_square": _median(trajectory.reduced_chi_square),
     }
     for camera, rms in zip(CAMERAS, trajectory.reprojection_rms_px.T, strict=True):

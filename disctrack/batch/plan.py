@@ -143,8 +143,7 @@ def make_plan(
             jobs.append(Job("recording", name, folder, found.results(folder), rig, options))
         except Exception as error:  # an error of one recording must not stop the others
             failures[name] = failed(reason_of(error), about)
-    needed = {job.rig for job in jobs}
-    return [job for path, job in rigs.items() if path in needed], jobs, failures, undeclared
+    return [*rigs.values()], jobs, failures, undeclared
 
 
 def _has_views_of(place: Path, recording: Recording) -> bool:

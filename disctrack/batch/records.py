@@ -34,8 +34,7 @@ def write_row(folder: Path, row: Row) -> None:
 
     row : with the requested `stages`, and PATHS relative to the folder
     """
-    document = {"schema": SCHEMA, "schema_version": SCHEMA_VERSION, **row}
-    write_whole(folder / RECORD, json_file(document))
+    write_whole(folder / RECORD, json_file({"schema": SCHEMA, "schema_version": SCHEMA_VERSION, **row}))
 
 
 def read_row(folder: Path) -> Row | None:
@@ -48,13 +47,13 @@ def read_row(folder: Path) -> Row | None:
         return None
 
 
-def is_done(folder: Path, row: Row | None, requested: Stages) -> bool:
+def is_done(folder: Path, row: Row, requested: Stages) -> bool:
     """True if the row is of a measured recording with all requested stages, and all its files exist.
 
     The trajectory must have the row's fingerprint; `disctrack.trajectory.file.kept_or_made` decides whether it is the
     result of the present inputs.
     """
-    if row is None or row["status"] != MEASURED or not row.get("trajectory"):
+    if row["status"] != MEASURED or not row.get("trajectory"):
         return False
     made = [(row["stages"].get(stage), value) for stage, value in requested.items()]
     suffices = all(there == value or (value is False and there is True) for there, value in made)

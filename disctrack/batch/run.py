@@ -63,10 +63,8 @@ class BatchOutcome:
 
     def report(self) -> Report:
         """Report of the recordings and the problems."""
-        others = [*of_kind(Kind.OTHER, Severity.WARNING, self.problems)]
-        others += of_kind(
-            Kind.OTHER, Severity.NOTE, [f"{name}: left out, images and no {FILE_NAME}" for name in self.undeclared]
-        )
+        left_out = [f"{name}: left out, images and no {FILE_NAME}" for name in self.undeclared]
+        others = of_kind(Kind.OTHER, Severity.WARNING, self.problems) + of_kind(Kind.OTHER, Severity.NOTE, left_out)
         found = report_of(self.rows, others, TOGETHER if self.together else "", self.files)
         together = f" All together: {self.together}" if self.together else ""
         return replace(found, verdict=found.verdict + together)
@@ -105,8 +103,8 @@ def run_batch(
         first, step = shard or (1, 1)
         if not 1 <= first <= step:
             raise ArgumentError(f"run_batch: shard is {shard}; expected (i, n) with i from 1 to n")
-        mine = found.recordings[first - 1 :: step]
-        rigs, jobs, records, undeclared = make_plan(found, mine, options)
+        mine = slice(first - 1, None, step)
+        rigs, jobs, records, undeclared = make_plan(found, found.recordings[mine], options)
         if cluster is None:
             # cores that are not used by other recordings read images ahead
             threads = max(1, cores // max(1, min(n, len(jobs))))
@@ -119,12 +117,10 @@ def run_batch(
     return replace(done, undeclared=tuple(str(seen_from(found.base, place)) for place in undeclared))
 
 
-def summarise_batch(
-    folders: Sequence[Path], options: BatchOptions | None = None, output: str | Path | None = None
-) -> BatchOutcome:
+def summarise_batch(folders: Sequence[Path], options: BatchOptions, output: Path | None) -> BatchOutcome:
     """Write the summary of the results on the disk, without measuring. Raises RecordingError."""
     found = find_recordings(folders, output)
-    return _summed_up(found, found.recordings, {}, options or BatchOptions(), False, default_threads())
+    return _summed_up(found, slice(None), {}, options, False, default_threads())
 
 
 def _do(rigs: list[Job], jobs: list[Job], records: dict[str, Row], pool: Processes | Cluster) -> str:
@@ -145,13 +141,17 @@ def _do(rigs: list[Job], jobs: list[Job], records: dict[str, Row], pool: Process
 
 def _summed_up(
     found: FoundRecordings,
-    mine: Sequence[Path],
+    mine: slice,
     records: dict[str, Row],
     options: BatchOptions,
     interrupted: bool,
     processes: int,
 ) -> BatchOutcome:
-    """Diagnosis of all together and summary; processes : for that diagnosis, 0 to omit it."""
+    """Diagnosis of all together and summary.
+
+    mine : recordings of this batch or shard
+    processes : for that diagnosis, 0 to omit it
+    """
     problems = [f"not searched: {problem}" for problem in found.problems]
     said = ""
     if options.together and processes and not interrupted:
@@ -168,9 +168,7 @@ def _summed_up(
         problems.append(str(error))
         rows = rows_of(found, records)
     files += (found.common / TOGETHER,) if said else ()
-    names = {found.name(folder) for folder in mine}
-    own = tuple(row for row in rows if row["recording"] in names)
-    return BatchOutcome(own, files, tuple(problems), interrupted, said)
+    return BatchOutcome(tuple(rows[mine]), files, tuple(problems), interrupted, said)
 
 
 def diagnose_all(folder: Path, rows: Sequence[Row], processes: int) -> str:
@@ -200,8 +198,8 @@ def rows_of(found: FoundRecordings, records: Mapping[str, Row]) -> list[Row]:
         name, results = found.name(folder), found.results(folder)
         known = records[name] if name in records else _on_the_disk(folder, results)
         row: Row = {column: known.get(column) for column in COLUMNS} | {"recording": name}
-        paths = {what: results / row[what] for what in PATHS if row[what]} | {"folder": folder}
-        paths |= {"rig": Path(row["rig"])} if row["rig"] else {}
+        # the rig's path is absolute
+        paths = {what: results / row[what] for what in (*PATHS, "rig") if row[what]} | {"folder": folder}
         rows.append(row | {what: seen_from(found.common, path).as_posix() for what, path in paths.items()})
     return rows
 
