@@ -195,12 +195,11 @@ def _rendered(fault: Fault, scene: Scene, folder: Path, tree: Tree, size: float)
 def _declared_wrong(fault: Fault, folder: Path, tree: Tree, size: float) -> None:
     """Change the declaration and the rig so that the unchanged images have the fault."""
     wrong, disc = _with(fault, -size), read_recording(folder).disc
-    rig = cameras_with(wrong, read_rig(tree["calibration"]["rig"]))
+    write_rig(folder / "rig.h5", cameras_with(wrong, read_rig(tree["calibration"]["rig"])))
     tree["markers"]["centres_mm"] = (1e3 * centres_with(wrong, disc)[:, :2]).tolist()
     tree["disc"]["thickness_mm"] = 2e3 * float(disc.half_thickness + 1e-3 * wrong.pattern_height_mm)
     tree["cameras"]["frame_rate_hz"] *= wrong.frame_rate_hz or 1.0
     tree["calibration"] = {"rig": str(folder / "rig.h5")}
-    write_rig(folder / "rig.h5", rig)
 
 
 def declare(folder: Path, tree: Tree) -> None:

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.cameras.camera import StereoRig
 from calibration.kit.arrays import AnyArray, Array, Mask
@@ -43,7 +42,6 @@ STRATA_DEG = ((0.5, 1.0), (1.0, 2.0), (2.0, 5.0), (5.0, 10.0), (10.0, 20.0), (20
 FIELD_RADIUS = 25e-3  # [m] largest distance of the disc from the middle of the field, with all dots in both images
 BORDER_PX = 14  # for the window around a dot
 SMALLEST_SEMI_MINOR_PX = 3.2  # below, the blurred centre of a dot is not black
-
 GROSS = (0.5e-3, np.radians(1.0))  # [m, rad] of position and rotation, above which a pose is wrong, not inaccurate
 
 
@@ -105,7 +103,7 @@ def compare(trajectory: Trajectory, q_true: Array) -> PoseErrors:
 
 def joined(parts: Iterable[PoseErrors]) -> PoseErrors:
     """All poses of several comparisons."""
-    return PoseErrors(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+    return PoseErrors(*map(np.concatenate, zip(*(vars(one).values() for one in parts), strict=True)))
 
 
 @dataclass(frozen=True)
@@ -116,7 +114,7 @@ class RenderedOutcome:
     seed: int
     own: PoseErrors
     true: PoseErrors
-    cameras: NDArray[np.int64]  # (n,) that see the upper face
+    cameras: AnyArray  # (n,) whole numbers: how many see the upper face
     systematic_px: tuple[float, float]  # of each camera, common to all frames
     warnings: tuple[str, ...]
 
@@ -258,7 +256,7 @@ def _pose(stratum: Array, rig: StereoRig, disc: Disc, middle: Array, rng: np.ran
     raise SceneError("no place found where all dots lie in both images; widen the field (rig.mm_per_px, image_size)")
 
 
-def cameras_in_sight(q: Array, rig: StereoRig, disc: Disc) -> NDArray[np.int64]:
+def cameras_in_sight(q: Array, rig: StereoRig, disc: Disc) -> AnyArray:
     """(n,) number of cameras that see enough dots for a pose, 0 to 2, in the poses q (n, 6).
 
     The upper face must face the camera, and the semi-minor axis of the image of a dot, which is an ellipse, must be
