@@ -7,14 +7,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration import (
-    Board,
-    BoardTolerances,
-    Observations,
-    calibrate_from_corners,
-    calibrate_from_points,
-    refine_stereo,
-)
+import calibration
+from calibration import Board, BoardTolerances, calibrate_from_corners, calibrate_from_points, refine_stereo
 from calibration.fit.board_motion import BoardMotion, motions
 from calibration.fit.priors import BEND, MISPRINT, STRETCH, board_basis, priors_of
 from calibration.fit.refinement import Problem
@@ -192,7 +186,7 @@ def test_a_rig_file_keeps_where_the_boards_were(tmp_path):
     _, record = read_rig_file(tmp_path / "rig.h5")
     places = {name: record[name][:, None].repeat(2, axis=1) for name in ("R_left_board", "t_left_board")}
     model = replace(found.refinement.model, **places)
-    o = Observations(*(record[name] for name in ("view", "camera", "point", "pixels", "pixels_covariance")))
+    o = calibration.Observations(*(record[name] for name in ("view", "camera", "point", "pixels", "pixels_covariance")))
     assert_allclose(o.pixels - predict_pixels(model, o), record["residuals"], atol=1e-9)
     assert [found.view_names[v] for v in record["apart"]] == list(found.view_names)
 

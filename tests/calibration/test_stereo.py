@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from calibration import (
-    Board,
-    BoardNotFound,
-    CalibrationError,
-    Camera,
-    calibrate_from_corners,
-    calibrate_stereo,
-)
+from calibration import Board, BoardNotFound, CalibrationError, Camera, calibrate_from_corners, calibrate_stereo
 from calibration.board.chessboard import board_orders
 from calibration.cameras.camera import rotation_from_vector, triangulate
 from calibration.judge.assessment import shifts_of_points

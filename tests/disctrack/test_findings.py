@@ -5,18 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from disctrack.findings import (
-    DoubtWarning,
-    Finding,
-    Kind,
-    Remedy,
-    Severity,
-    Subject,
-    finding_from_json,
-    in_doubt,
-    leading,
-    warn_of_doubts,
-)
+from disctrack import findings
+from disctrack.findings import Finding, Kind, Remedy, Severity, Subject, leading
 from disctrack.numbers import Measured
 
 NOISE = Finding(Kind.POSES_SCATTER, Severity.WARNING, "poses scatter")
@@ -39,8 +29,8 @@ def test_the_cause_comes_first_and_its_consequences_are_left_out():
 def test_a_cause_is_as_grave_as_what_it_explains():
     delay = Finding(Kind.DELAY, Severity.NOTE, "a camera lags", explains=(Kind.DOTS_MISFIT,))
     assert leading([delay, MISFIT]) == (replace(delay, severity=Severity.DOUBT),)
-    assert in_doubt([MISFIT])
-    assert not in_doubt([delay])
+    assert findings.in_doubt([MISFIT])
+    assert not findings.in_doubt([delay])
 
 
 def test_of_two_that_explain_each_other_the_first_is_told():
@@ -56,12 +46,12 @@ def test_the_sentence_begins_with_what_to_type():
 
 def test_a_finding_comes_back_from_json_as_it_was():
     for finding in (NOISE, MISFIT, EXCHANGED, SQUARE):
-        assert finding_from_json(json.loads(json.dumps(finding.as_json()))) == finding
-    later = finding_from_json({**NOISE.as_json(), "kind": "of a later version"})
+        assert findings.finding_from_json(json.loads(json.dumps(finding.as_json()))) == finding
+    later = findings.finding_from_json({**NOISE.as_json(), "kind": "of a later version"})
     assert later.kind == Kind.OTHER
 
 
 def test_doubts_are_python_warnings_and_their_consequences_are_not():
-    with pytest.warns(DoubtWarning) as told:
-        warn_of_doubts([MISFIT, EXCHANGED, NOISE])
+    with pytest.warns(findings.DoubtWarning) as told:
+        findings.warn_of_doubts([MISFIT, EXCHANGED, NOISE])
     assert [str(w.message) for w in told] == [EXCHANGED.sentence]

@@ -11,14 +11,8 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from disctrack import MarkerStatus, Trajectory, frames
-from disctrack.analyse.declaration import (
-    balance,
-    contradictions,
-    handedness,
-    motion_against_gravity,
-    other_scale,
-    unseen_dots,
-)
+from disctrack.analyse import declaration
+from disctrack.analyse.declaration import contradictions
 from disctrack.findings import Kind, Severity
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
@@ -52,7 +46,7 @@ def any_honest(request):
 
 @pytest.mark.statistical
 def test_honest_motions_are_not_contradicted(any_honest):
-    gravity, _ = balance(any_honest)
+    gravity, _ = declaration.balance(any_honest)
     assert contradictions(any_honest) == ()
     assert len(gravity) >= 8
     sigma = np.std(gravity) / np.sqrt(len(gravity))
@@ -124,10 +118,10 @@ def test_a_push_between_the_stretches_that_are_looked_at_is_no_film_that_runs_ba
     before, after = (true_motion(theta, 0.302, 1e-9) for theta in (10.0, 12.0))
     parts = {k: np.concatenate([getattr(m, k)[:300] for m in (before, after)]) for k in ("R_world_body", "position")}
     pushed = as_tracked(replace(before, time=1e-3 * np.arange(600), **parts), np.random.default_rng(0))
-    gravity, energy = balance(pushed)
+    gravity, energy = declaration.balance(pushed)
     assert energy[-5:].mean() > 1.05 * energy[:5].mean()
     assert abs(np.median(gravity) / 9.81 - 1) < 2e-3
-    assert motion_against_gravity(pushed) == ()
+    assert declaration.motion_against_gravity(pushed) == ()
 
 
 def test_a_hand_that_turns_the_disc_and_a_disc_at_rest_give_no_verdict():
@@ -186,7 +180,7 @@ def test_a_chessboard_of_another_scale_is_told_from_the_dots(scale, honest):
     square = next(r for r in finding.remedies if r.key == "[calibration] square_mm")
     assert abs(float(square.action.split()[1]) * scale - 1) < 1e-3
     # the true square of a board is named first
-    known = other_scale(finding.numbers["scale"], 6e-3 * scale)
+    known = declaration.other_scale(finding.numbers["scale"], 6e-3 * scale)
     assert known.remedies[0].key == "[calibration] square_mm"
     assert abs(float(known.remedies[0].fits) - 6.0) < 5e-3
 
@@ -201,7 +195,7 @@ def test_a_dot_without_which_the_layout_repeats_spoils_the_spin_angle(honest):
     hexagon[:, :2] = 0.03 * np.column_stack([np.cos(SIXTHS), np.sin(SIXTHS)])
     seventh = np.vstack([hexagon, hexagon[:1] * [0.4, 0.4, 1.0]])
     disc = replace(honest.disc, marker_centres_body=seventh)
-    (finding,) = unseen_dots(with_dots(replace(honest, disc=disc), 1.0, unseen=(6,)), disc)
+    (finding,) = declaration.unseen_dots(with_dots(replace(honest, disc=disc), 1.0, unseen=(6,)), disc)
     assert finding.doubtful, "six dots in a hexagon are left"
 
 
@@ -214,21 +208,21 @@ def cameras_at(left_deg, right_deg, off_vertical_deg=(40.0, 40.0)):
 @pytest.mark.parametrize("turn_deg", [0.0, 57.0, 143.0, 229.0])
 def test_a_mirrored_world_is_told_by_the_cameras_places_or_by_dots_without_an_axis(turn_deg, honest):
     left_deg, right_deg = turn_deg - 110.0, turn_deg - 70.0
-    assert handedness(cameras_at(left_deg, right_deg), honest.disc) == ()
+    assert declaration.handedness(cameras_at(left_deg, right_deg), honest.disc) == ()
     mirrored = cameras_at(-left_deg, -right_deg)
-    (finding,) = handedness(mirrored, honest.disc)
+    (finding,) = declaration.handedness(mirrored, honest.disc)
     assert finding.doubtful
     assert "mirrored" in finding.sentence
     assert "exchanged" in finding.sentence
     asymmetric = honest.disc.marker_centres_body.copy()
     asymmetric[0, :2] *= 0.6
     lopsided = replace(honest.disc, marker_centres_body=asymmetric)
-    assert handedness(mirrored, lopsided) == ()
+    assert declaration.handedness(mirrored, lopsided) == ()
 
 
 def test_cameras_that_face_each_other_tell_no_left_and_right(honest):
     across, above = cameras_at(0.0, 179.0), cameras_at(-90.0, -90.0, (1.0, 34.0))
-    assert handedness(across, honest.disc) == handedness(above, honest.disc) == ()
+    assert declaration.handedness(across, honest.disc) == declaration.handedness(above, honest.disc) == ()
 
 
 def test_a_dot_that_is_not_seen_costs_precision_and_a_rate_spoils_every_velocity(honest):
