@@ -287,13 +287,15 @@ def a_day(recording: Path, root: Path, names: tuple[str, ...] = NAMES) -> Path:
     return root
 
 
-def start(root: Path, *words: str) -> subprocess.Popen:
-    """`disctrack batch` in a process group of its own."""
-    command = [sys.executable, "-m", "disctrack", "batch", str(root), "--no-report", "-j", "2", *words]
+def start(root: Path) -> subprocess.Popen:
+    """`disctrack batch` in a process group of its own, when it has begun with a recording."""
+    command = [sys.executable, "-m", "disctrack", "batch", str(root), "--no-report", "-j", "2"]
     pipe = subprocess.PIPE
-    return subprocess.Popen(
+    process = subprocess.Popen(
         command, cwd=REPOSITORY, stdout=pipe, stderr=pipe, text=True, start_new_session=True, preexec_fn=heed_interrupts
     )
+    wait_until(lambda: any((root / name / "results" / LOCK).exists() for name in NAMES), process)
+    return process
 
 
 def heed_interrupts() -> None:
@@ -307,10 +309,6 @@ def wait_until(condition, process=None) -> None:
     while not condition() and (process is None or process.poll() is None):
         assert time.monotonic() < until
         time.sleep(0.01)
-
-
-def begun(root: Path) -> bool:
-    return any((root / name / "results" / LOCK).exists() for name in NAMES)
 
 
 def numbers(path: Path) -> dict[str, np.ndarray]:
@@ -354,7 +352,6 @@ def test_a_batch_killed_at_random_instants_leaves_only_whole_results_and_can_go_
     assert do(job)["status"] == MEASURED  # in this process
     results = root / "a" / "results"
     process = start(root)
-    wait_until(lambda: begun(root), process)
     began = time.monotonic()
     assert "leaked" not in process.communicate(timeout=PATIENCE)[1]  # of what processes that end owe to the system
     duration, chance = time.monotonic() - began, random.Random(17)
@@ -363,7 +360,6 @@ def test_a_batch_killed_at_random_instants_leaves_only_whole_results_and_can_go_
             shutil.rmtree(results)
         (results / LOCK).unlink(missing_ok=True)  # a dead process's: it would seem to have begun
         process = start(root)
-        wait_until(lambda: begun(root), process)
         time.sleep(chance.uniform(0, duration))
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate(timeout=PATIENCE)
@@ -404,7 +400,6 @@ def test_where_no_process_can_be_started_all_is_as_before(monkeypatch):
 def test_an_interrupted_batch_says_so_clears_up_and_can_go_on(recording, tmp_path, kind):
     day = a_day(recording, tmp_path / "day", tuple("abcdefgh"))  # more than are done while this process looks
     process = start(day)
-    wait_until(lambda: begun(day), process)
     os.killpg(process.pid, kind)  # as a terminal does: to all processes
     said, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 128 + kind
@@ -421,7 +416,6 @@ def test_processes_end_with_a_batch_that_is_killed(recording, tmp_path):
     """Only the batch itself, as when memory runs out: the recording at work must not stay locked."""
     day = a_day(recording, tmp_path / "day", tuple("abcdefgh"))
     process = start(day)
-    wait_until(lambda: begun(day), process)
     process.kill()
     process.communicate(timeout=PATIENCE)
     for name in NAMES:
