@@ -304,11 +304,13 @@ def heed_interrupts() -> None:
         signal.signal(kind, signal.SIG_DFL)
 
 
-def wait_until(condition, process=None) -> None:
+def wait_until(condition, process=None):
+    """What the condition is, once it is true or the process has ended."""
     until = time.monotonic() + PATIENCE
-    while not condition() and (process is None or process.poll() is None):
+    while not (found := condition()) and (process is None or process.poll() is None):
         assert time.monotonic() < until
         time.sleep(0.01)
+    return found
 
 
 def numbers(path: Path) -> dict[str, np.ndarray]:
@@ -456,11 +458,15 @@ def test_recordings_for_which_no_process_can_be_started_fail_with_that_reason(da
 @pytest.mark.statistical
 @_OF_ANOTHER_PROJECT
 def test_a_cluster_that_loses_a_worker_in_mid_run_completes_everything(day):
-    distributed = pytest.importorskip("distributed")
+    distributed, psutil = map(pytest.importorskip, ("distributed", "psutil"))
+
+    def measuring():
+        """Workers of whose processes one holds a lock."""
+        found = {worker: worker.children() for worker in map(psutil.Process, (w.pid for w in cluster.workers.values()))}
+        return [w for w, own in found.items() if any(Path(f.path).name == LOCK for p in own for f in p.open_files())]
 
     def kill_one():
-        wait_until(lambda: all((day / name / "results" / LOCK).exists() for name in NAMES))
-        os.kill(cluster.workers[0].pid, signal.SIGKILL)  # both recordings are being measured, so one is lost with it
+        wait_until(measuring)[0].kill()
 
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         killer = threading.Thread(target=kill_one, daemon=True)
