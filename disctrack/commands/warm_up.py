@@ -13,7 +13,7 @@ from calibration.kit.compiled import FOLDER
 from disctrack import rolling
 from disctrack.discrepancy.equations import _ode_kernel
 from disctrack.recording.readers import _pixel_kernels
-from disctrack.synthetic import raster
+from disctrack.synthetic import _raster_kernel as raster
 from disctrack.track.follow.tracking import prepare
 
 

@@ -22,7 +22,7 @@ from disctrack.discrepancy.system import Budget, Candidate, Quantity, System, Va
 from disctrack.faults.catalogue import faults_of, scene_faults
 from disctrack.faults.dots import Sight, predict
 from disctrack.frames import euler_jacobian, euler_rate_axes_world, rotation_from_euler
-from disctrack.rolling import Model, sensitivities, simulate
+from disctrack.rolling import Effort, Model, sensitivities, simulate
 from disctrack.track.pose import whitening
 from disctrack.track.refine.table_contact import ASSUMED_THICKNESS as MICROMETER
 from disctrack.track.refine.table_contact import thickness_tolerance
@@ -359,9 +359,8 @@ class DiscSystem(System):
         # a motion that needs more steps is given up
         left = int(min(self.budget.trial_left, self.trial_work * (ROLLS if rolls else 1.0)))
         of_state = [n.partition(".")[2] for n in components]
-        moving = sensitivities(
-            model, state, times, tuple(parameters.values()), of_state, motion.THETA_END, RTOL, limit, left
-        )
+        effort = Effort(RTOL, limit, left)
+        moving = sensitivities(model, state, times, tuple(parameters.values()), of_state, motion.THETA_END, effort)
         self.budget.work(moving.n_steps)
         by_motion, moved = moving.dq.copy(), (*components, *parameters)
         by_motion[:, 3:] = euler_rate_axes_world(moving.q[:, 3], moving.q[:, 4]) @ moving.dq[:, 3:]

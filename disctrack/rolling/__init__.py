@@ -12,6 +12,7 @@ from disctrack.rolling.model import effects_from_tables as effects_from_tables
 from disctrack.rolling.motion import EndReason as EndReason
 from disctrack.rolling.motion import Motion as Motion
 from disctrack.rolling.records import Regime as Regime
+from disctrack.rolling.simulate import Effort as Effort
 from disctrack.rolling.simulate import prepare as prepare
 from disctrack.rolling.simulate import sensitivities as sensitivities
 from disctrack.rolling.simulate import simulate as simulate

@@ -15,7 +15,7 @@ constants). The responses to hundreds of laws thus need no further integration.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import CodeType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,17 +37,25 @@ from disctrack.rolling.motion import EndReason, Motion, Path, Switch, columns, c
 from disctrack.rolling.records import BODY, INSTANT, ROLLING_COMPONENTS, STATE_COMPONENTS, Records, Regime, record_dtype
 from disctrack.rolling.state import State, steady_precession
 
-RTOL = 1e-11  # of the integrator; without dissipation the energy is constant to 1e-11 over 1.5 s
 # m, m, rad, rad, rad, rad/s x 3, m/s x 2, m, m/s: about 1e-12 of the typical values
 ATOL = np.array([1e-13, 1e-13, 1e-12, 1e-13, 1e-12, 1e-11, 1e-11, 1e-11, 1e-13, 1e-13, 1e-13, 1e-13])
-MAX_SWITCHES = 2000  # between slip and rolling; more is chatter
-MOST_STEPS = 1_000_000  # of the integrator, over all regimes
 COMPONENTS = ("M_n", "M_m", "M_z", "X_n", "X_m", "X_z")  # of moment and force in `responses`
 _PROBE = effect_from_formulas("probe", {c: f"{c}_given" for c in COMPONENTS})
 _SEED = 1e-30  # imaginary part; its square is far below rounding errors
 _ASKEW = ("com_1", "com_2", "J_12", "J_13", "J_23")  # nonzero in a body without symmetry about its axis
 # Kinematics with which a law depends on a direction of the table.
 _OF_DIRECTION = {"x", "y", "psi", *(f"{v}{a}" for v in ("table_", "table_v", "table_a", "field_") for a in "xy")}
+
+
+class Effort(NamedTuple):
+    """How accurately a motion is integrated, and how far."""
+
+    rtol: float = 1e-11  # without dissipation the energy is constant to 1e-11 over 1.5 s
+    max_switches: int = 2000  # between slip and rolling; more is chatter: the motion ends, and has no derivatives
+    max_steps: int = 1_000_000  # of the integrator, in all regimes and runs; after these derivatives are NaN
+
+
+FULL = Effort()
 
 
 @checked
@@ -157,15 +165,7 @@ class Assembly:
         return self.body[name][0]
 
 
-def follow(
-    assembly: Assembly,
-    y: Numbers,
-    grid: Array,
-    rtol: float = RTOL,
-    max_switches: int = MAX_SWITCHES,
-    max_steps: int = MOST_STEPS,
-    scale: float = 0.0,
-) -> Path:
+def follow(assembly: Assembly, y: Numbers, grid: Array, effort: Effort = FULL, scale: float = 0.0) -> Path:
     """Integrate through the regimes until the grid or the motion ends; complex if the assembly is.
 
     scale : as for `integrate.integrate`
@@ -188,7 +188,8 @@ def follow(
         event = _event_at_start(assembly, regime, t, y)
         if event < 0:
             system, atol = assembly.system(regime), ATOL[: len(y)]
-            Y, t, y, event, n = integrate.integrate(system, t, y, grid[i:], rtol, atol, scale, max_steps - n_steps)
+            left = effort.max_steps - n_steps
+            Y, t, y, event, n = integrate.integrate(system, t, y, grid[i:], effort.rtol, atol, scale, left)
             n_steps += n
             if len(Y):  # empty if the steps are used up before the first instant
                 add(grid[i : i + len(Y)], Y)
@@ -202,7 +203,7 @@ def follow(
             if end is None:
                 switches.append(Switch(float(np.real(t)), Regime(regime), Regime(new)))
                 regime = new
-                if len(switches) > max_switches:
+                if len(switches) > effort.max_switches:
                     end = EndReason.CHATTER
     if not segments:  # the motion ends at its start
         add(grid[:1], y[None])
@@ -281,16 +282,12 @@ def sensitivities(
     parameters: Sequence[str] = (),
     components: Sequence[str] | None = None,
     theta_end: float = DEFAULT_THETA_END,
-    rtol: float = RTOL,
-    max_switches: int = MAX_SWITCHES,
-    max_steps: int = MOST_STEPS,
+    effort: Effort = FULL,
 ) -> Sensitivities:
     """Derivatives of q(t) and qdot(t) with respect to initial state and parameters.
 
     parameters : "effect.parameter" names; an effect that is not in the model has its null value.
     components : of records.STATE_COMPONENTS; by default all that the state has.
-    max_switches : between rolling and slip; with more, the motion ends and has no derivatives.
-    max_steps : of the integrator, in all runs together; after these the derivatives are NaN.
     """
     grid = _grid(None, 0.0, times)
     y0 = _start(state, theta_end)
@@ -300,7 +297,7 @@ def sensitivities(
     names = (*components, *parameters)
     found = np.full((len(grid), 20, 1 + len(names)), np.nan)  # q, qdot and state: the motion, then its derivatives
     assembly = Assembly(enlarged, theta_end)
-    path = follow(assembly, y0, grid, rtol, max_switches, max_steps)
+    path = follow(assembly, y0, grid, effort)
     n_steps = path.n_steps
     found[: len(path.now), :, 0] = _numbers(path)
     if path.end is not EndReason.CHATTER:
@@ -318,7 +315,7 @@ def sensitivities(
             else:
                 moved = Assembly(enlarged, theta_end, complex, {name: enlarged.values[name] + 1j * _SEED})
                 scale = _scale(moved, path, grid)
-            run = follow(moved, y, grid, rtol, max_steps=max_steps - n_steps, scale=scale)
+            run = follow(moved, y, grid, effort._replace(max_steps=effort.max_steps - n_steps), scale)
             n_steps += run.n_steps
             found[: len(run.now), :, column] = _numbers(run).imag / _SEED
     q, qdot, _ = np.split(found[..., 0], [6, 12], axis=1)

@@ -10,7 +10,8 @@ from calibration.kit.arrays import Array, Array32
 from disctrack.disc import Disc
 from disctrack.faults.keys import Occluder
 from disctrack.frames import CAMERAS, rotation_from_euler
-from disctrack.synthetic import optics, raster
+from disctrack.synthetic import _raster_kernel as raster
+from disctrack.synthetic import optics
 from disctrack.synthetic.cameras import View, image_of, views_of
 from disctrack.synthetic.description import Scene
 

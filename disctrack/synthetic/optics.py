@@ -14,9 +14,9 @@ from calibration.cameras.camera import Camera, normalise
 from calibration.kit.arrays import Array, Array32, Image
 from calibration.kit.compiled import njit
 from disctrack.errors import SceneError
+from disctrack.synthetic._raster_kernel import between
 from disctrack.synthetic.cameras import View
 from disctrack.synthetic.description import ImperfectionSettings, Scene, SensorSettings
-from disctrack.synthetic.raster import between
 
 _TEXTURE_SIZE = 1024  # texels per side
 _TEXEL = 0.25e-3  # [m]; the texture repeats after 256 mm
@@ -72,8 +72,8 @@ def blur_weights(sigma: float, s: int) -> Array32:
     """Weights of the cells around a pixel: Gaussian point spread function (sigma [px]) convolved with a square pixel.
 
     (2 reach s + s,) for pixels -reach ... reach: the convolution at the centres of the cells, normalised. Light at
-    distance u from the centre of a cell is deposited as 1 there and +-u / 2 in its neighbours (`raster`). That has the
-    second moment -u^2 about its true position, -1 / (12 s^2) px^2 on average, which is compensated in sigma^2.
+    distance u from the centre of a cell is deposited as 1 there and +-u / 2 in its neighbours (`_raster_kernel`). That
+    has the second moment -u^2 about its true position, -1 / (12 s^2) px^2 on average, which is compensated in sigma^2.
     """
     reach = blur_reach(sigma)
     widened = np.sqrt(sigma**2 + 1 / (12 * s**2))

@@ -176,7 +176,6 @@ def measure_pairs(
     settings: TrackingSettings | None = None,
     timestamps: Times | None = None,
     threads: Threads = 1,
-    progress: Progress = silent,
 ) -> Measurement:
     """Measure the disc's pose in every pair; every frame is measured (no rest is left out).
 
@@ -210,7 +209,7 @@ def measure_pairs(
 
     began = time.perf_counter()
     taken = Taken(range(n), frame_rate, gravity, times, settings or TrackingSettings())
-    found = track(read_blocks, taken, rig, disc, threads, progress)
+    found = track(read_blocks, taken, rig, disc, threads, silent)
     seconds = time.perf_counter() - began
     findings = contradictions(found.trajectory, disc, noticed=found.trajectory.findings)
     warn_of_doubts(findings)

@@ -20,7 +20,7 @@ from disctrack.discrepancy.search import CLASS_GAIN
 from disctrack.discrepancy.system import Quantity
 from disctrack.faults.keys import Faults
 from disctrack.frames import nodal_axes_world
-from disctrack.rolling import Model, State, sensitivities, simulate, steady_precession
+from disctrack.rolling import Effort, Model, State, sensitivities, simulate, steady_precession
 from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.model import body_constants
 from tests.oracles import newton_euler
@@ -242,7 +242,7 @@ def test_slip_that_takes_too_long_is_not_followed():
     whole = sensitivities(model, start, times, components=["theta"])
     assert np.isfinite(whole.dq).all()
     assert whole.n_steps > 1000
-    cut = sensitivities(model, start, times, components=["theta"], max_steps=whole.n_steps // 4)
+    cut = sensitivities(model, start, times, components=["theta"], effort=Effort(max_steps=whole.n_steps // 4))
     assert not np.isfinite(cut.dq).all()
     assert cut.n_steps <= whole.n_steps // 4
 
