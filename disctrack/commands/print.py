@@ -18,12 +18,13 @@ def run(arguments: argparse.Namespace) -> None:
         disc = recording.disc
         if recording.chessboard is not None:
             corners, square_mm = recording.chessboard.inner_corners, 1e3 * recording.chessboard.square
-    sheets = {
-        arguments.output / "dots.pdf": dots_figure(disc, arguments.paper, dark=not arguments.light_dots),
-        arguments.output / "board.pdf": board_figure(corners, square_mm, arguments.paper),
-    }
-    for path in sheets:
+    dots, board = arguments.output / "dots.pdf", arguments.output / "board.pdf"
+    for path in (dots, board):
         refuse_existing(path, arguments.overwrite)
+    sheets = {
+        dots: dots_figure(disc, arguments.paper, dark=not arguments.light_dots),
+        board: board_figure(corners, square_mm, arguments.paper),
+    }
     for path, figure in sheets.items():
         print(f"{'sheet':<13} {outputs.relative(save_figure(figure, path))}")
     print(f"{'':<13} print at 100 %, and measure the bar of 100 mm on each sheet")

@@ -115,12 +115,20 @@ Shape = Mapping[str, float]
 # title, kind, terms; grid of the shape parameters
 Row = tuple[str, str, tuple[Parts, ...]] | tuple[str, str, tuple[Parts, ...], Iterable[Shape]]
 
-# lower and upper bound of each shape parameter, and its scale: of places, angles, times, widths
-SHAPES = dict.fromkeys(("edge", "x0", "y0"), (-np.inf, np.inf, 1e-4))
-SHAPES |= dict.fromkeys(("angle", "direction"), (-np.inf, np.inf, 0.01))
-SHAPES |= {"instant": (-np.inf, np.inf, 1e-3), "rate": (0.0, np.inf, 0.1)}
-SHAPES |= dict.fromkeys(("softness", "lasting"), (5e-4, 0.1, 1e-4))
-SHAPES |= {"width": (0.04, 2.0, 0.01), "length": (1e-3, 0.05, 1e-4)}
+# lower and upper bound of each shape parameter, and its scale
+SHAPES = {
+    "rate": (0.0, np.inf, 0.1),
+    "edge": (-np.inf, np.inf, 1e-4),
+    "softness": (5e-4, 0.1, 1e-4),
+    "instant": (-np.inf, np.inf, 1e-3),
+    "lasting": (5e-4, 0.1, 1e-4),
+    "angle": (-np.inf, np.inf, 0.01),
+    "direction": (-np.inf, np.inf, 0.01),
+    "width": (0.04, 2.0, 0.01),
+    "length": (1e-3, 0.05, 1e-4),
+    "x0": (-np.inf, np.inf, 1e-4),
+    "y0": (-np.inf, np.inf, 1e-4),
+}
 LOCKED = {"angle", "magnet", "bump phi", "bump psi"}  # kinds of families
 
 
@@ -172,10 +180,10 @@ def families(q: Array, time: Array, frame_rate: float, disc: Disc) -> Iterator[F
 
 
 def _by_rates() -> Iterator[Row]:
-    moments = [(f"a moment M_{axis}", f"M_{axis}", "moment") for axis in MOMENTS]
-    forces = [(f"a force {c}", c, kind) for c, kind in (("X_z", "lift"), ("X_n", "force"), ("X_m", "force"))]
-    for (words, formula), (title, component, kind) in (*product(SCALARS, moments), *product(SCALARS, forces)):
-        yield f"{title} by {words}", kind, ({component: formula},)
+    for (words, formula), axis in product(SCALARS, MOMENTS):
+        yield f"a moment M_{axis} by {words}", "moment", ({f"M_{axis}": formula},)
+    for (words, formula), (c, kind) in product(SCALARS, (("X_z", "lift"), ("X_n", "force"), ("X_m", "force"))):
+        yield f"a force {c} by {words}", kind, ({c: formula},)
 
 
 def _path_of_contact(q: Array, disc: Disc) -> Array:

@@ -209,8 +209,16 @@ def planned_recording(proposal: Proposal, system: DiscSystem, values: Values) ->
     seen = np.where(np.isfinite(pixels).all(-1), MarkerStatus.MEASURED, MarkerStatus.OUTSIDE)
     covariance, status = np.broadcast_to(usual, (n, 2, m, 2, 2)), seen.astype(np.uint8)
     # other arrays by frame are not used by the system
-    filmed = replace(part(old, slice(0, 1)), time=motion.time, q=motion.q, frame_rate=rate, **changed)
-    filmed = replace(filmed, markers_px=pixels, markers_covariance_px2=covariance, marker_status=status)
+    filmed = replace(
+        part(old, slice(0, 1)),
+        time=motion.time,
+        q=motion.q,
+        markers_px=pixels,
+        markers_covariance_px2=covariance,
+        marker_status=status,
+        frame_rate=rate,
+        **changed,
+    )
     planned = DiscSystem(filmed, replace(system.model, **changed), rows=slice(0, n), systematic=system.systematic)
     return planned, kept | {q.name: x for q, x in zip(state_quantities(), start.array[:8].tolist(), strict=True)}
 

@@ -144,8 +144,10 @@ def _with_law(
     gain = (diagnosis.before.cost - fitted.cost) / noise
     learned = Learned(law.candidate, gain, held_gain, np.nan, (), law, power, course, misfit)
     reason = f"{diagnosis.reason}; the law that was learned leaves {fitted.reduced_chi_square:.3g}"
-    diagnosis = replace(diagnosis, found=established, after=after, held_out_after=held)
-    return known, learned, replace(diagnosis, verdict="unexplained", reason=reason), not_claimed
+    diagnosis = replace(
+        diagnosis, verdict="unexplained", found=established, after=after, held_out_after=held, reason=reason
+    )
+    return known, learned, diagnosis, not_claimed
 
 
 def _for_any_form(kept: Sequence[Found], fitted: Fit, looked: float) -> tuple[tuple[Found, ...], tuple[str, ...]]:

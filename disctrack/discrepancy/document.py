@@ -173,14 +173,14 @@ def fit_errors(fit: Fit, held: HeldOut | None, noise: float, with_known: bool) -
 
 
 def document(
-    d: Diagnosis, model: str, sentence: str, *sides: Mapping[str, Any], with_known: bool = True
-) -> dict[str, Any]:
+    d: Diagnosis, model: str, sentence: str, before: Mapping[str, Any] = {}, after: Mapping[str, Any] = {}, *,
+    with_known: bool = True,
+) -> dict[str, Any]:  # fmt: skip
     """The diagnosis in types that `json_text.plain` knows; the keys are those that `disctrack diagnose` writes.
 
-    sides : errors before and after in the system's own units, if it has such
+    before, after : errors in the system's own units, if it has such
     with_known : are parameters with a prior among those of the laws?
     """
-    before, after = sides or ({}, {})
     return {
         "verdict": d.verdict,
         "sentence": sentence,
@@ -206,25 +206,25 @@ def document(
     }
 
 
-def tables(d: Diagnosis, hidden: tuple[str, ...] = ("state.", "learned.")) -> list[Section]:
+def tables(d: Diagnosis) -> list[Section]:
     """Indistinguishable explanations, fitted parameters before and after, and the outcome of all candidates.
 
-    hidden : prefixes of the names of parameters that are not listed; a learned law is shown by its course
+    A learned law is shown by its course, and not by its parameters.
     """
-    fitted = [q for q in d.after.quantities if not (q.name.startswith(hidden) or q.is_initial)]
+    fitted = [q for q in d.after.quantities if not (q.owner == "learned" or q.is_initial)]
     fits = d.before, d.after
     rows = [("chi-square per degree of freedom", *(rounded(f.reduced_chi_square / d.noise, 4) for f in fits))]
     for q in fitted:
         sizes = (measured(f.values[q.name], f.sigma(q.name), q.unit) if q.name in f.names else "" for f in fits)
         rows.append((q.name, *sizes))
     return [
-        Section("Explanations that compete", [_explanations(d)]),
+        explanations(d),
         Section("Fitted numbers", [Listing(("value ± 1 σ", "before", "after"), rows if fitted else ())]),
-        Section("What was tried", [_tried(d)]),
+        tried(d),
     ]
 
 
-def _explanations(d: Diagnosis) -> Listing:
+def explanations(d: Diagnosis) -> Section:
     """Sets of effects that are indistinguishable from the answer; empty where there is only one."""
     sets = explanations_json(d)
     rows = [
@@ -234,10 +234,11 @@ def _explanations(d: Diagnosis) -> Listing:
         "Longer by: -2 log evidence minus that of the answer; it is chi-square, a penalty for each parameter, and the "
         "prior of the sizes."
     )
-    return Listing(("effects", "longer by", "odds against the answer"), rows if len(rows) > 1 else (), caption)
+    listed = Listing(("effects", "longer by", "odds against the answer"), rows if len(rows) > 1 else (), caption)
+    return Section("Explanations that compete", [listed])
 
 
-def _tried(d: Diagnosis) -> Listing:
+def tried(d: Diagnosis) -> Section:
     """Outcome of every candidate; empty columns are omitted."""
     rows = [
         (t.candidate.title, t.candidate.name, score(t.score), score(t.gain), score(t.held_out_gain), t.reason)
@@ -250,4 +251,5 @@ def _tried(d: Diagnosis) -> Listing:
         "out: over data that the fit has not seen."
     )
     cells = [[row[i] for i in filled] for row in rows]
-    return Listing([header[i] for i in filled], cells, caption, folded=f"All {len(rows)} candidates")
+    listed = Listing([header[i] for i in filled], cells, caption, folded=f"All {len(rows)} candidates")
+    return Section("What was tried", [listed])

@@ -262,12 +262,24 @@ class _Search:
         if self.system.frees_shapes and first is self.base_model and self._add_free_shapes(best):
             best, alternatives = self._selected()
         after = self.base_model if alternatives is None else best
-        found = tuple(self._found(best, c, r) for c, r in zip(best.candidates, alternatives or (), strict=False))
+        pairs = () if alternatives is None else zip(best.candidates, alternatives, strict=True)
+        found = tuple(self._found(best, *pair) for pair in pairs)
         ranked = tuple(replace(e, length=self.length(e)) for e in self._ranked())
-        verdict, nearest = self._verdict(after, found), best if alternatives is None else None
-        held, tried = (self._held_out(base), self._held_out(after.fit)), self._all_outcomes(scores, found)
-        answer = Diagnosis(*verdict, found, base, after.fit, *held, self.noise, tried, self.settings)
-        return replace(answer, nearest=nearest, ranked=ranked, length=self.length(after), chance=by_chance)
+        return Diagnosis(
+            *self._verdict(after, found),
+            found,
+            base,
+            after.fit,
+            self._held_out(base),
+            self._held_out(after.fit),
+            self.noise,
+            self._all_outcomes(scores, found),
+            self.settings,
+            best if alternatives is None else None,
+            ranked,
+            self.length(after),
+            chance=by_chance,
+        )
 
     def _verdict(self, after: Explanation, found: tuple[Found, ...]) -> tuple[Verdict, str]:
         """Verdict and reason."""

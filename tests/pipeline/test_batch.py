@@ -462,8 +462,9 @@ def test_a_cluster_that_loses_a_worker_in_mid_run_completes_everything(day):
 
     def measuring():
         """Workers of whose processes one holds a lock."""
-        found = {worker: worker.children() for worker in map(psutil.Process, (w.pid for w in cluster.workers.values()))}
-        return [w for w, own in found.items() if any(Path(f.path).name == LOCK for p in own for f in p.open_files())]
+        workers = [psutil.Process(worker.pid) for worker in cluster.workers.values()]
+        with contextlib.suppress(psutil.NoSuchProcess):  # one that ends now
+            return [w for w in workers for p in w.children() for f in p.open_files() if Path(f.path).name == LOCK]
 
     def kill_one():
         wait_until(measuring)[0].kill()

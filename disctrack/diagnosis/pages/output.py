@@ -14,7 +14,7 @@ from disctrack.diagnosis.law_library import locked
 from disctrack.diagnosis.model_file import NONE, PAPER
 from disctrack.diagnosis.plan import ENOUGH, Plan
 from disctrack.diagnosis.supplement import HORIZONS, Supplement
-from disctrack.discrepancy.document import document, effect_json, effect_text, significance_text, tables
+from disctrack.discrepancy.document import document, effect_json, effect_text, explanations, significance_text, tried
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.significance import TWO_SIDED
 from disctrack.files.json_text import json_text, plain
@@ -60,7 +60,6 @@ def report_of(
             f"Probability that noise alone produces this improvement: p {probability(d.chance.p_value)} "
             f"({d.chance.tests:.0f} independent candidates)."
         )
-    competing, _, tried = tables(d)
     notes = [*result.remarks, *(f"{note[:1].upper()}{note[1:]}." for note in result.notes)]
     return Report(
         f"{recording}: what does the model lack?",
@@ -71,10 +70,10 @@ def report_of(
             f"Verdict: {d.verdict}, because {d.reason}. Model: {MODELS.get(result.model, result.model)}.",
             Section("Missing effects", [effects, *laws]),
             planned_section(result.plan),
-            competing,
+            explanations(d),
             Section("Before and after" if result.has_more else "The model", _before_after(result, more)),
             Section("In pictures", [Figures(drawn)]),
-            tried,
+            tried(d),
         ],
         files=files,
         page=files[0],

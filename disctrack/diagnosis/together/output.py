@@ -10,7 +10,7 @@ import numpy as np
 
 from disctrack.diagnosis.answer import unnamed
 from disctrack.diagnosis.pages.output import plan_json, planned_section
-from disctrack.discrepancy.document import document, effect_text, significance_text, tables
+from disctrack.discrepancy.document import document, effect_text, significance_text, tried
 from disctrack.discrepancy.joint.covariates import equivalent
 from disctrack.discrepancy.joint.together import Bound, Dependence, OfRecording, TogetherDiagnosis
 from disctrack.discrepancy.search import Diagnosis
@@ -31,9 +31,8 @@ MANY = (
 def verdict_text(answer: TogetherDiagnosis) -> str:
     """The effect missing in all recordings."""
     d, left_out = answer.diagnosis, [r for r in answer.recordings if r.reason]
-    of_all = f"{len(answer.recordings) - len(left_out)} recordings together" + (
-        f" ({len(left_out)} left out)" if left_out else ""
-    )
+    n = len(answer.recordings) - len(left_out)
+    of_all = f"{n} recordings together" + (f" ({len(left_out)} left out)" if left_out else "")
     effects = "; and ".join(effect_text(f, d) for f in d.found)
     if d.held_out_after is None:
         return f"{of_all}: no answer, {d.reason}."
@@ -135,7 +134,7 @@ def report_of(answer: TogetherDiagnosis, drawn: Sequence[Drawn], files: Sequence
             Section("Each recording against the others", [_recordings(answer)]),
             Section("What many recordings bring", [MANY, _by_number(answer)]),
             planned_section(answer.plan),
-            tables(d)[-1],  # what was tried
+            tried(d),
         ],
         files=files,
         page=files[0],

@@ -320,7 +320,7 @@ class Answer:
                 Section("Equations", [[f"d{k}/dt = {v}" for k, v in self.equations.rates.items()]]),
                 Section("Before and after", [_before_after(self)]),
                 Section("In pictures", [Figures(drawn)]),
-                *tables(self.diagnosis, ("state.", f"{NAME}.")),
+                *tables(self.diagnosis),
             ],
         )
 

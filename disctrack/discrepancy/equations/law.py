@@ -564,7 +564,8 @@ def _course(system: EquationSystem, law: Along, names: Sequence[str], values: Va
     (now, _, by_number), (before, *_) = (
         f.rates_at(s, system.numbers({**values, **changed}, s), times, states) for changed in ({}, declared)
     )
-    own = by_number[:, here, [[*f.numbers].index(name) for name in names]]
+    column = {name: i for i, name in enumerate(f.numbers)}
+    own = by_number[:, here, [column[name] for name in names]]
     return (now - before)[:, here] / own[:, 0], own / own[:, :1]  # first that by the constant
 
 
