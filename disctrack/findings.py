@@ -191,7 +191,7 @@ def leading(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         rest += [finding] if finding not in rest else []
     found = []
     while rest:
-        cause = next((f for f in rest if not any(_explains(g, f) for g in rest)), rest[0])
+        cause = next((f for f in rest if not any(f.kind in g.explains and f.kind != g.kind for g in rest)), rest[0])
         folded, kinds = [cause], set(cause.explains)
         while more := [f for f in rest if f.kind in kinds and f not in folded]:
             folded += more
@@ -199,10 +199,6 @@ def leading(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         rest = [f for f in rest if f not in folded]
         found.append(replace(cause, severity=max(f.severity for f in folded)))
     return tuple(sorted(found, key=lambda finding: -finding.severity))
-
-
-def _explains(one: Finding, other: Finding) -> bool:
-    return one.kind != other.kind and other.kind in one.explains
 
 
 def carried(findings: Iterable[Finding]) -> tuple[Finding, ...]:

@@ -48,7 +48,6 @@ def report_of(
             Section("Method", [_method(analysis, provenance)]),
         ],
         files=(page, trajectory_file),
-        page=page,
         then=f"disctrack diagnose {trajectory_file}",
         data={"frames": len(trajectory), "frames_with_a_pose": int(trajectory.measured.sum())},
     )

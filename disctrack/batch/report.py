@@ -43,7 +43,6 @@ def report_of(
             Section("Repeats", _repeats(rows)),
         ],
         files=files,
-        page=next((file for file in files if file.name == "index.html"), None),
     )
 
 

@@ -105,13 +105,12 @@ def show_report(report: Report, arguments: argparse.Namespace, folder: Path, *, 
     elif not arguments.quiet:
         again = "reused: the complete result of the same input, settings and version"
         said = of_kind(Kind.OTHER, Severity.NOTE, [again] if reused else [])
-        page = None if report.page is None else relative(report.page)
         files = [relative(file) for file in report.files]
         text = folder / SUMMARY
         if reused and arguments.verbose and text.is_file():
             print(again, text.read_text(encoding="utf-8"), sep="\n\n", end="")
         else:
-            shown = replace(report, findings=[*report.findings, *said], files=files, page=page)
+            shown = replace(report, findings=[*report.findings, *said], files=files)
             show(shown, verbose=arguments.verbose)
 
 

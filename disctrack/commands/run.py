@@ -38,7 +38,6 @@ def run(arguments: argparse.Namespace) -> int:
         verdict=f"{tracked.verdict} {verdict}",
         blocks=[Section("Calibration", [Facts(whole), *known.blocks]), Section("Tracking", tracked.blocks)],
         files=[*known.files, *tracked.files, summary],
-        page=summary,
     )
     write_whole(summary, ("\n".join(full(report)) + "\n").encode())
     return outputs.finish(report, arguments, folder)

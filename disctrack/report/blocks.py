@@ -84,10 +84,14 @@ class Report:
     findings: Sequence[Finding] = ()
     facts: Sequence[tuple[str, Cell]] = ()  # the few numbers at the top of a page
     blocks: Sequence[Block] = ()
-    files: Sequence[Path] = ()
-    page: Path | None = None  # with the details
+    files: Sequence[Path] = ()  # that were written
     then: str = ""  # the next command
     data: Mapping[str, Any] = field(default_factory=dict)  # of the stage, for programs: part of the JSON document
+
+    @property
+    def page(self) -> Path | None:
+        """The file with the details: the first page or text among the files."""
+        return next((file for file in self.files if file.suffix in (".html", ".txt")), None)
 
     def graver_first(self) -> list[Finding]:
         """The findings, most severe first; the order within a severity is kept."""
@@ -125,9 +129,8 @@ def restored(kept: Mapping[str, Any], data: Mapping[str, Any]) -> Report:
     """The report from its document and the data of its stage."""
     findings = [finding_from_json(finding) for finding in kept["findings"]]
     files = [Path(file) for file in kept["files"]]
-    page = Path(kept["page"]) if kept["page"] else None
     head = kept["title"], kept["verdict"], kept["accuracy"]
-    return Report(*head, findings, files=files, page=page, then=kept["next"], data={**kept, **data})
+    return Report(*head, findings, files=files, then=kept["next"], data={**kept, **data})
 
 
 def _cell(cell: Cell) -> Cell:

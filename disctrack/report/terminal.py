@@ -20,7 +20,7 @@ _COLOURS = {"refusal": "31;1", "doubt": "31;1", "warning": "33", "verdict": "1"}
 def short(report: Report, width: int = WIDTH, *, colour: bool = False) -> list[str]:
     """Doubts, verdict, accuracy, other findings, page and next command, in at most MOST_LINES."""
     first = _entry("verdict", report.verdict, width, _MOST_OF_ONE) + _entry("accuracy", report.accuracy, width, 2)
-    last = _entry("page", "" if report.page is None else str(report.page), width) + _entry("next", report.then, width)
+    last = _facts([("page", str(report.page or "")), ("next", report.then)], width)
     entries = [_entry(finding.grave, finding.sentence, width, _MOST_OF_ONE) for finding in report.graver_first()]
     room = MOST_LINES - len(first) - len(last)
     while sum(map(len, entries)) > room - (len(entries) < len(report.findings)) and len(entries) > 1:
@@ -33,14 +33,12 @@ def short(report: Report, width: int = WIDTH, *, colour: bool = False) -> list[s
 
 def full(report: Report, width: int = WIDTH) -> list[str]:
     """The complete report."""
-    first = _entry("verdict", report.verdict, width) + _entry("accuracy", report.accuracy, width)
     lines = [report.title, ""] if report.title else []
+    first = _facts([("verdict", report.verdict), ("accuracy", report.accuracy)], width)
     lines += _around(first, [_entry(f.grave, f.sentence, width) for f in report.graver_first()], report)
     lines += [*_facts(report.facts, width), *_blocks(shown(report.blocks, (Figures, Markup)), width)]
-    lines += _entry("page", "" if report.page is None else str(report.page), width)
-    for i, file in enumerate(report.files):
-        lines += _entry("" if i else "files", str(file), width)
-    return lines + _entry("next", report.then, width)
+    files = [("" if i else "files", str(file)) for i, file in enumerate(report.files)]
+    return lines + _facts([("page", str(report.page or "")), *files, ("next", report.then)], width)
 
 
 def _around(result: list[str], entries: list[list[str]], report: Report) -> list[str]:
@@ -62,11 +60,11 @@ def _coloured(line: str) -> str:
     return f"\x1b[{_COLOURS[head]}m{head}\x1b[0m{line[len(head) :]}" if head in _COLOURS else line
 
 
-def _entry(head: str, said: str, width: int, most: int | None = None) -> list[str]:
+def _entry(head: str, said: Cell, width: int, most: int | None = None) -> list[str]:
     """A heading with its text, wrapped to its right; empty without text.   most : lines, the last with an ellipsis"""
     if not said or isinstance(said, Markup):
         return []
-    return _wrapped(said, max(width, 40), f"{head:<{_HEAD}} ", " " * (_HEAD + 1), most)
+    return _wrapped(str(said), max(width, 40), f"{head:<{_HEAD}} ", " " * (_HEAD + 1), most)
 
 
 def _wrapped(said: str, width: int, first: str = "", then: str = "", most: int | None = None) -> list[str]:
@@ -92,7 +90,7 @@ def _blocks(blocks: Iterable[Block], width: int) -> Iterator[str]:
 
 
 def _facts(rows: Iterable[tuple[str, Cell]], width: int) -> list[str]:
-    return [line for name, value in rows for line in _entry(name, str(value), width)]
+    return [line for name, value in rows for line in _entry(name, value, width)]
 
 
 def _table(listing: Listing, width: int) -> list[str]:

@@ -76,7 +76,6 @@ def report_of(
             tried(d),
         ],
         files=files,
-        page=files[0],
     )
 
 

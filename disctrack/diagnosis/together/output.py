@@ -137,7 +137,6 @@ def report_of(answer: TogetherDiagnosis, drawn: Sequence[Drawn], files: Sequence
             tried(d),
         ],
         files=files,
-        page=files[0],
     )
 
 

@@ -84,7 +84,7 @@ def test_every_writer_shows_the_same_number():
 def test_a_terminal_gets_ten_lines_the_gravest_first_and_is_told_of_the_rest():
     said = of_kind(Kind.OTHER, Severity.NOTE, [f"note {i} {'word ' * 30}" for i in range(9)])
     said += of_kind(Kind.OTHER, Severity.DOUBT, ["doubtful"])
-    found = report(verdict="long " * 200, findings=said, page=Path("a page.html"), then="disctrack next")
+    found = report(verdict="long " * 200, findings=said, files=[Path("a page.html")], then="disctrack next")
     lines = short(found, 80)
     assert 8 <= len(lines) <= 10
     assert lines[0].split() == ["doubt", "doubtful"]  # before the result
