@@ -92,7 +92,12 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
         return seen
     seen.seen.append(("declaration", f"{recording.file} is complete"))
     with seen.refusing(Kind.READING):
-        pairs = _frames(seen, recording)
+        pairs = open_pairs(recording)
+        width, height = pairs.left.image_size
+        lasts = f"{len(pairs) / recording.frame_rate:.3g} s at {recording.frame_rate:g} Hz"
+        size = f"{width} x {height} px, {pairs.left.bit_depth} bit"
+        seen.seen.append(("frames", f"{len(pairs)} pairs of {size}, {lasts}"))
+        seen.findings += pairs.findings
     progress("chessboard")
     with seen.refusing(Kind.CALIBRATION):
         rig = _rig(seen, recording)
@@ -111,15 +116,6 @@ def run_check(folder: Path, progress: Callable[[str], None] = lambda step: None)
             _motion(seen, recording, rig, pairs)
     seen.findings += images_lost(seen.not_read)
     return seen
-
-
-def _frames(seen: Check, recording: Recording) -> ImagePairs:
-    pairs = open_pairs(recording)
-    width, height = pairs.left.image_size
-    lasts = f"{len(pairs) / recording.frame_rate:.3g} s at {recording.frame_rate:g} Hz"
-    seen.seen.append(("frames", f"{len(pairs)} pairs of {width} x {height} px, {pairs.left.bit_depth} bit, {lasts}"))
-    seen.findings += pairs.findings
-    return pairs
 
 
 def _rig(seen: Check, recording: Recording) -> StereoRig:
