@@ -107,19 +107,15 @@ def residuals(result: DiscDiagnosis) -> Drawn:
 
 def free_run(result: DiscDiagnosis) -> Drawn:
     """Error of the free run over the held-out data."""
-    system = result.system
-    position, nutation = list[Curve](), list[Curve]()
-
-    def add(errors: Array, colour: str, label: str) -> None:
-        position.append(Curve(system.time, 1e3 * np.linalg.norm(errors[:, :3], axis=1), colour, label))
-        nutation.append(Curve(system.time, np.degrees(np.abs(errors[:, 4])), colour))
-
+    system, runs = result.system, list[tuple[Array, str, str]]()
     for _, held, name, colour in _sides(result):
         assert held is not None
         error, sigma = system.coordinate_errors(held.train.values)
-        add(error, colour, name)
+        runs.append((error, colour, name))
         last = system.time[~held.test_rows & (system.weights > 0)].max()
-    add(sigma, MUTED, "noise, 1 σ")
+    runs.append((sigma, MUTED, "noise, 1 σ"))
+    position = [Curve(system.time, 1e3 * np.linalg.norm(e[:, :3], axis=1), colour, name) for e, colour, name in runs]
+    nutation = [Curve(system.time, np.degrees(np.abs(e[:, 4])), colour) for e, colour, _ in runs]
     rows = ("error of position (mm)", position), ("error of nutation (deg)", nutation)
     figure = chart("time (s)", *rows, size=(9.5, 4.4))
     for axes in figure.axes:
