@@ -48,8 +48,7 @@ def report_of(
 
 def counts(rows: Sequence[Row]) -> dict[str, int]:
     """Number of recordings of each status."""
-    statuses = [row["status"] for row in rows]
-    return {status: statuses.count(status) for status in (MEASURED, SKIPPED, FAILED, NOT_MEASURED)}
+    return {one: sum(row["status"] == one for row in rows) for one in (MEASURED, SKIPPED, FAILED, NOT_MEASURED)}
 
 
 def _verdict(rows: Sequence[Row]) -> str:
