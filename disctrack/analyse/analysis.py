@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from disctrack.analyse.contact import Circle, RollingOnset, locus_circle, rolling_onset
 from disctrack.analyse.derivatives import CHANNELS, MeasuredMotion, differentiate
@@ -76,7 +75,9 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
         trajectory = part(trajectory, slice(int(tracked[0]), int(tracked[-1]) + 1))
     motion = differentiate(trajectory)
     found = propagate(motion)
-    until, sense = _end_of_rolling(motion, found.value[:, COLUMN["psidot"]])
+    psidot = found.value[:, COLUMN["psidot"]]
+    sense = float(np.sign(np.nansum(psidot))) or 1.0  # of the precession
+    until = power_law_end(motion.time, sense * motion.euler[:, 0], sense * psidot)
     onset = rolling_onset(found, until)
     if onset.low > motion.time[motion.known][0]:  # the acceleration jumps when slip ends
         del motion, found  # to save memory
@@ -97,14 +98,6 @@ def analyse(trajectory: Trajectory, window: float = WINDOW, circle_duration: flo
         nutation_count=count_nutation(psi, motion.euler[:, 1], motion.tilt_sigma, motion.disc),
         findings=of_kind(Kind.ANALYSIS, Severity.WARNING, _findings(trajectory, motion, onset)),
     )
-
-
-def _end_of_rolling(motion: MeasuredMotion, psidot: Array) -> tuple[float, float]:
-    """Instant [s] at which the precession is stopped (or the recording ends), and the sign of the precession."""
-    if not np.isfinite(psidot).any():
-        return np.inf, 1.0
-    sense = float(np.sign(np.nansum(psidot))) or 1.0
-    return power_law_end(motion.time, sense * motion.euler[:, 0], sense * psidot), sense
 
 
 def _findings(trajectory: Trajectory, motion: MeasuredMotion, onset: RollingOnset) -> Iterator[str]:
