@@ -99,9 +99,7 @@ def _log_normal(v: Array, C: Array, extra: float) -> Array:
 
 
 def _slip_distance(time: Array, v: Array, C: Array, share: Array) -> tuple[float, float]:
-    """Integral of |v| and its sigma; the variance of the noise is subtracted from |v|^2."""
-    if len(time) < 2:
-        return 0.0, 0.0
+    """Integral of |v| and its sigma, 0 for fewer than two frames; the variance of noise is subtracted from |v|^2."""
     noise2 = np.trace(C, axis1=1, axis2=2)
     speed = np.sqrt(np.maximum(np.sum(v * v, axis=1) - noise2, 0.0))
     step = np.diff(time)
