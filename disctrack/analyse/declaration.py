@@ -177,15 +177,11 @@ def lost_pairs(trajectory: Trajectory) -> Iterator[Finding]:
     """Image pairs that both cameras dropped while the files were numbered consecutively."""
     for row, lost in clock_jumps(trajectory).items():
         frame = int(trajectory.frame[row])
-        yield Finding(
-            Kind.CLOCK_JUMP,
-            Severity.DOUBT,
-            f"frame {frame}: {in_words(lost)}; all later times are wrong",
-            Subject(frames=((frame, frame),)),
-            {"pairs": Measured(lost)},
-            (Remedy(action=f"number the files from {frame} on higher by {lost}"),),
-            (Kind.GRAVITY_OR_RATE, Kind.REVERSED, Kind.POSES_SCATTER),
-        )
+        text = f"frame {frame}: {in_words(lost)}; all later times are wrong"
+        of, size = Subject(frames=((frame, frame),)), {"pairs": Measured(lost)}
+        advice = (Remedy(action=f"number the files from {frame} on higher by {lost}"),)
+        explains = Kind.GRAVITY_OR_RATE, Kind.REVERSED, Kind.POSES_SCATTER
+        yield Finding(Kind.CLOCK_JUMP, Severity.DOUBT, text, of, size, advice, explains)
 
 
 # A declared number that may be wrong: |ln| of the fitting value over an ordinary one; kind; remedy. The smallest is the
