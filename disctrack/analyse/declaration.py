@@ -302,18 +302,17 @@ def _radius_suspected(trajectory: Trajectory, ratio: float, height: float | None
     return (misfit, Kind.RADIUS, remedy)
 
 
-def density(disc: Disc) -> tuple[Finding, ...]:
+def density(disc: Disc) -> Iterator[Finding]:
     """A disc lighter than a hard foam or heavier than osmium: mass, radius or thickness is in a wrong unit."""
     found = disc.mass / (2 * np.pi * disc.radius**2 * disc.half_thickness)
-    if 50.0 < found < 23e3:
-        return ()
-    sizes = {"mass_g": disc.mass, "radius_mm": disc.radius, "thickness_mm": 2 * disc.half_thickness}
-    remedies = tuple(Remedy(f"[disc] {key}", declared=f"{1e3 * size:g}") for key, size in sizes.items())
-    text = (
-        f"mass, radius and thickness give the disc a density of {1e-3 * found:.2g} g/cm³; expected 0.05 (foam) to 23 "
-        "(osmium)"
-    )
-    return (Finding(Kind.DENSITY, Severity.WARNING, text, remedies=remedies),)
+    if not 50.0 < found < 23e3:
+        sizes = {"mass_g": disc.mass, "radius_mm": disc.radius, "thickness_mm": 2 * disc.half_thickness}
+        remedies = tuple(Remedy(f"[disc] {key}", declared=f"{1e3 * size:g}") for key, size in sizes.items())
+        text = (
+            f"mass, radius and thickness give the disc a density of {1e-3 * found:.2g} g/cm³; expected 0.05 (foam) to "
+            "23 (osmium)"
+        )
+        yield Finding(Kind.DENSITY, Severity.WARNING, text, remedies=remedies)
 
 
 def balance(trajectory: Trajectory) -> tuple[Array, Array]:
@@ -503,11 +502,10 @@ def unseen_dots(trajectory: Trajectory, declared: Disc) -> Iterator[Finding]:
         yield Finding(Kind.DOT_UNSEEN, severity, text, Subject(dot=int(dot)), remedies=(remedy,))
 
 
-def turned_board(inner_corners: Sequence[int]) -> tuple[Finding, ...]:
+def turned_board(inner_corners: Sequence[int]) -> Iterator[Finding]:
     """Corners counted along the short side first rotate the axes of the table by 90 deg."""
     first, second = inner_corners
-    if first >= second:
-        return ()
-    remedy = Remedy("[calibration] inner_corners", f"[{second}, {first}]", f"[{first}, {second}]")
-    text = "corners are counted along the short side first, so that x runs along it; expected the long side first"
-    return (Finding(Kind.CORNERS, Severity.DOUBT, text, remedies=(remedy,)),)
+    if first < second:
+        remedy = Remedy("[calibration] inner_corners", f"[{second}, {first}]", f"[{first}, {second}]")
+        text = "corners are counted along the short side first, so that x runs along it; expected the long side first"
+        yield Finding(Kind.CORNERS, Severity.DOUBT, text, remedies=(remedy,))

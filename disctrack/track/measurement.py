@@ -250,13 +250,12 @@ def _tracked(
     return replace(found, unreadable=dict(sorted(not_read.items())))
 
 
-def images_lost(not_read: NotRead) -> tuple[Finding, ...]:
+def images_lost(not_read: NotRead) -> Iterator[Finding]:
     """Finding about images that could not be read."""
-    if not not_read:
-        return ()
-    n, where = len(not_read), "their frames rest on one camera or none"
-    text = f"{n} image{'s' * (n > 1)} could not be read; {where}. The first: {not_read[min(not_read)]}"
-    return (Finding(Kind.UNREADABLE, Severity.WARNING, text, explains=(Kind.FRAMES_LOST,)),)
+    if n := len(not_read):
+        where = "their frames rest on one camera or none"
+        text = f"{n} image{'s' * (n > 1)} could not be read; {where}. The first: {not_read[min(not_read)]}"
+        yield Finding(Kind.UNREADABLE, Severity.WARNING, text, explains=(Kind.FRAMES_LOST,))
 
 
 def refuse_unreadable(recording: Recording, lost: NotRead, n: int, error: TrackingError) -> None:

@@ -26,7 +26,7 @@ from disctrack.synthetic.cameras import all_inside, rig_of
 from disctrack.synthetic.description import GlareSettings, Scene
 from disctrack.synthetic.recording import Truth, run_render
 from disctrack.track.measurement import measure, open_pairs
-from disctrack.track.pose import MIN_DOTS
+from disctrack.track.pose import MIN_DOTS, dots_at
 from disctrack.trajectory import Trajectory, part
 from disctrack.validate.points import LABORATORY
 
@@ -263,8 +263,7 @@ def cameras_in_sight(q: Array, rig: StereoRig, disc: Disc) -> AnyArray:
     above SMALLEST_SEMI_MINOR_PX.
     """
     R = rotation_from_euler(*q[:, 3:].T)
-    _, by_point, _ = rig.project_with_jacobians(disc.marker_centres_body @ np.swapaxes(R, 1, 2) + q[:, None, :3])
-    half_axes = 0.5 * disc.marker_diameter * by_point @ R[:, None, None, :, :2]  # of the ellipses, conjugate
+    half_axes = 0.5 * disc.marker_diameter * dots_at(R, q[:, :3], rig, disc)[1]  # of the ellipses, conjugate
     facing = np.linalg.det(half_axes) < 0  # y of the image points down
     semi_minor = facing * np.linalg.svd(half_axes, compute_uv=False)[..., 1]
     return np.sum(np.sum(semi_minor > SMALLEST_SEMI_MINOR_PX, axis=2) >= MIN_DOTS, axis=1)
