@@ -87,7 +87,8 @@ def contradictions(
     boards : in the views of the calibration;  blur_px : of the edges of the dots, per camera
     """
     disc, board = disc or trajectory.disc, None if recording is None else recording.chessboard
-    found = [*density(disc), *scale_of_dots(trajectory, disc), *unseen_dots(trajectory, disc), *lost_pairs(trajectory)]
+    found = [*density(disc), *scale_of_dots(trajectory, disc, None if board is None else board.square)]
+    found += *unseen_dots(trajectory, disc), *lost_pairs(trajectory)
     if trajectory.rig.world_is_table:
         found += handedness(trajectory.rig, disc)
         off = next((f for f in noticed if f.kind == Kind.TABLE_DISAGREES), None)
@@ -98,18 +99,7 @@ def contradictions(
         if recording is not None and recording.table is not None and off is not None and not elsewhere:
             found += thickness(disc, recording.table.board_thickness, off)
     found += () if board is None else turned_board(board.inner_corners)
-    return (*with_square([*found, *noticed], recording), *(unsharp(trajectory, blur_px) if blur_px else ()))
-
-
-def with_square(findings: Sequence[Finding], recording: Recording | None) -> tuple[Finding, ...]:
-    """Findings from the dots, which do not know the board: a wrong scale also suggests the matching square."""
-    if recording is None or recording.chessboard is None:
-        return tuple(findings)
-    square = recording.chessboard.square
-    return tuple(
-        other_scale(finding.numbers["scale"], square, finding.explains) if finding.kind == Kind.SQUARE else finding
-        for finding in findings
-    )
+    return (*found, *noticed, *(unsharp(trajectory, blur_px) if blur_px else ()))
 
 
 def thickness(disc: Disc, board: float, off: Finding) -> tuple[Finding, ...]:
@@ -436,8 +426,8 @@ def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
     return (Finding(Kind.HANDEDNESS, Severity.DOUBT, text, remedies=remedies),)
 
 
-def scale_of_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:
-    """Ratio of the triangulated distances of the dots to those of their declared centres."""
+def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None) -> tuple[Finding, ...]:
+    """Ratio of the triangulated distances of the dots to those of their declared centres; square : of `other_scale`."""
     rows = np.flatnonzero(trajectory.measured)
     rows = rows[evenly(len(rows), 50)]
     good = (trajectory.marker_status[rows] == MarkerStatus.MEASURED).all(axis=1)
@@ -456,7 +446,7 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]
     typical = _typical(per_pair)
     # pairs share dots: there are only as many independent distances as dots
     scale = replace(typical, sigma=max(typical.sigma * np.sqrt(len(per_pair) / dots), 1e-4))
-    return (other_scale(scale),) if _beyond(scale, 1.0, SCALE) else ()
+    return (other_scale(scale, square),) if _beyond(scale, 1.0, SCALE) else ()
 
 
 def other_scale(scale: Measured, square: float | None = None, explains: tuple[Kind, ...] = BY_SCALE) -> Finding:

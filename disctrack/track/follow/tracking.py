@@ -75,7 +75,7 @@ def track(
         """With the dots expected at the positions of a disc."""
         followers, tables = _followed(read_blocks, edges, replace(begin, disc=expected), workers, progress)
         if not np.isfinite(tables.t).any():
-            raise _not_found(followers, pairs, why_not_seen(_some(read_blocks, pairs), rig, disc))
+            raise _not_found(followers, pairs, why_not_seen(_some(read_blocks, pairs), rig, disc, taken.board))
         return assemble([replace(follower, disc=disc) for follower in followers], tables, taken, workers)
 
     tracking = measured(disc, progress)
@@ -88,7 +88,7 @@ def track(
     if off > LOOK_AGAIN and not _faulty(tracking.trajectory.findings):
         tracking = measured(found, silent)
     noticed = (*dropped, *tracking.trajectory.findings)
-    arranged = why_not_seen(_conflicts(tracking, noticed, read_blocks, pairs), rig, disc)
+    arranged = why_not_seen(_conflicts(tracking, noticed, read_blocks, pairs), rig, disc, taken.board)
     return replace(tracking, trajectory=replace(tracking.trajectory, findings=(*arranged, *noticed, *stuck)))
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.board.target import Board
 from calibration.cameras.camera import StereoRig, causes
 from calibration.kit.arrays import AnyArray, Array, Codes, Mask
 from calibration.kit.brief import Brief
@@ -57,13 +58,14 @@ class Measurement(Brief):
 
 @dataclass(frozen=True)
 class Taken:
-    """Which pairs are measured, their times, gravity, and the options."""
+    """Which pairs are measured, their times, gravity, the options, and the board of the calibration."""
 
     pairs: range
     frame_rate: float  # [Hz]
     gravity: float = 9.81  # [m/s^2]
     stamps: Array | None = None  # [s] of all frames, written by the camera
     settings: TrackingSettings = TrackingSettings()
+    board: Board | None = None  # as declared: its square may be wrong if the dots contradict it
 
     @property
     def time(self) -> Array:
