@@ -88,7 +88,7 @@ def contradictions(
     """
     disc, board = disc or trajectory.disc, None if recording is None else recording.chessboard
     found = [*density(disc), *scale_of_dots(trajectory, disc, None if board is None else board.square)]
-    found += *unseen_dots(trajectory, disc), *lost_pairs(trajectory)
+    found += [*unseen_dots(trajectory, disc), *lost_pairs(trajectory)]
     if trajectory.rig.world_is_table:
         found += handedness(trajectory.rig, disc)
         off = next((f for f in noticed if f.kind == Kind.TABLE_DISAGREES), None)
