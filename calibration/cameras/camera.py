@@ -200,8 +200,8 @@ class StereoRig(Brief):
 
     def project(self, points_world: Array) -> Array:
         """Pixels (..., 2 cameras, n, 2) of points (..., n, 3) [m]; NaN behind a camera."""
-        placed = zip(self.cameras, self.camera_poses(), strict=True)
-        return np.stack([project(points_world @ R.T + t, camera) for camera, (R, t) in placed], axis=-3)
+        views = zip(self.cameras, self.camera_poses(), strict=True)
+        return np.stack([project(points_world @ R.T + t, camera) for camera, (R, t) in views], axis=-3)
 
     def project_with_jacobians(self, points_world: Array) -> tuple[Array, Array, Array]:
         """Pixels (..., 2, n, 2), d/d point_world (..., 2, n, 2, 3) and d/d RIG_PARAMETERS (..., 2, n, 2, 30)."""
@@ -249,11 +249,12 @@ def by_turning(d_point: Array, arm: Array) -> Array:
     return np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
 
 
-def placed_at(poses: Sequence[tuple[Array, Array]]) -> dict[str, Any]:
-    """Fields of a StereoRig from the poses of its cameras: R (3, 3), t (3,) from world to camera axes."""
-    (R_left, t_left), (R_right, t_right) = poses
+def placed(cameras: Sequence[tuple[Camera, Array, Array]]) -> dict[str, Any]:
+    """Fields of a StereoRig from its cameras, left first, each with R (3, 3), t (3,) from world to camera axes."""
+    (left, R_left, t_left), (right, R_right, t_right) = cameras
     R = R_right @ R_left.T
-    return {"R_right_left": R, "t_right_left": t_right - R @ t_left, "R_left_world": R_left, "t_left_world": t_left}
+    fields = {"left": left, "right": right, "R_right_left": R, "t_right_left": t_right - R @ t_left}
+    return fields | {"R_left_world": R_left, "t_left_world": t_left}
 
 
 def rotation_from_vector(v: Array) -> Array:

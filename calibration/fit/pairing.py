@@ -194,11 +194,6 @@ class Pairing:
         """(n,) pairs that agree with this relative pose."""
         return self.distance < TOO_FAR * self.usual
 
-    def is_likelier(self, stored: Pairing) -> bool:
-        """True if it is clearly more likely than the pairs as stored."""
-        beyond = stored.evidence + 2.0 * np.log(NEARER)
-        return self.evidence > beyond and 2 * int(self.agrees.sum()) > len(self.distance)
-
 
 def most_likely(left: BoardPoses, turns_of_right: Sequence[BoardPoses], floor: float) -> Pairing:
     """The most likely relative pose of the cameras; turns_of_right : with the board in each of its symmetries."""
@@ -255,7 +250,8 @@ def paired(
     others = [(how, by, a.views, most_likely(a, b, floor)) for how, by, (a, b) in tried if len(a.views) > MIN_VIEWS]
     if others:
         how, by, which, found = max(others, key=lambda one: one[-1].evidence)
-        if found.is_likelier(stored):
+        likelier = found.evidence > stored.evidence + 2.0 * np.log(NEARER)
+        if likelier and 2 * found.agrees.sum() > len(which):
             raise CalibrationError(_reason(how, found, stored, [(names[v][0], names[by[v]][1]) for v in which]))
     _require_agreement(stored, [found.evidence for how, _, _, found in others if how])
     notes = _late(pairs_of, of_left.views[~stored.agrees], stored, names)

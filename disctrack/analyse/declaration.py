@@ -87,7 +87,8 @@ def contradictions(
     boards : in the views of the calibration;  blur_px : of the edges of the dots, per camera
     """
     disc, board = disc or trajectory.disc, None if recording is None else recording.chessboard
-    found = [*density(disc), *scale_of_dots(trajectory, disc), *unseen_dots(trajectory, disc), *lost_pairs(trajectory)]
+    found = [*density(disc), *scale_of_dots(trajectory, disc, None if board is None else board.square)]
+    found += [*unseen_dots(trajectory, disc), *lost_pairs(trajectory)]
     if trajectory.rig.world_is_table:
         found += handedness(trajectory.rig, disc)
         off = next((f for f in noticed if f.kind == Kind.TABLE_DISAGREES), None)
@@ -98,18 +99,7 @@ def contradictions(
         if recording is not None and recording.table is not None and off is not None and not elsewhere:
             found += thickness(disc, recording.table.board_thickness, off)
     found += () if board is None else turned_board(board.inner_corners)
-    return (*with_square([*found, *noticed], recording), *(unsharp(trajectory, blur_px) if blur_px else ()))
-
-
-def with_square(findings: Sequence[Finding], recording: Recording | None) -> tuple[Finding, ...]:
-    """Findings from the dots, which do not know the board: a wrong scale also suggests the matching square."""
-    if recording is None or recording.chessboard is None:
-        return tuple(findings)
-    square = recording.chessboard.square
-    return tuple(
-        other_scale(finding.numbers["scale"], square, finding.explains) if finding.kind == Kind.SQUARE else finding
-        for finding in findings
-    )
+    return (*found, *noticed, *(unsharp(trajectory, blur_px) if blur_px else ()))
 
 
 def thickness(disc: Disc, board: float, off: Finding) -> tuple[Finding, ...]:
@@ -177,15 +167,11 @@ def lost_pairs(trajectory: Trajectory) -> Iterator[Finding]:
     """Image pairs that both cameras dropped while the files were numbered consecutively."""
     for row, lost in clock_jumps(trajectory).items():
         frame = int(trajectory.frame[row])
-        yield Finding(
-            Kind.CLOCK_JUMP,
-            Severity.DOUBT,
-            f"frame {frame}: {in_words(lost)}; all later times are wrong",
-            Subject(frames=((frame, frame),)),
-            {"pairs": Measured(lost)},
-            (Remedy(action=f"number the files from {frame} on higher by {lost}"),),
-            (Kind.GRAVITY_OR_RATE, Kind.REVERSED, Kind.POSES_SCATTER),
-        )
+        text = f"frame {frame}: {in_words(lost)}; all later times are wrong"
+        of, size = Subject(frames=((frame, frame),)), {"pairs": Measured(lost)}
+        advice = (Remedy(action=f"number the files from {frame} on higher by {lost}"),)
+        explains = Kind.GRAVITY_OR_RATE, Kind.REVERSED, Kind.POSES_SCATTER
+        yield Finding(Kind.CLOCK_JUMP, Severity.DOUBT, text, of, size, advice, explains)
 
 
 # A declared number that may be wrong: |ln| of the fitting value over an ordinary one; kind; remedy. The smallest is the
@@ -306,18 +292,17 @@ def _radius_suspected(trajectory: Trajectory, ratio: float, height: float | None
     return (misfit, Kind.RADIUS, remedy)
 
 
-def density(disc: Disc) -> tuple[Finding, ...]:
+def density(disc: Disc) -> Iterator[Finding]:
     """A disc lighter than a hard foam or heavier than osmium: mass, radius or thickness is in a wrong unit."""
     found = disc.mass / (2 * np.pi * disc.radius**2 * disc.half_thickness)
-    if 50.0 < found < 23e3:
-        return ()
-    sizes = {"mass_g": disc.mass, "radius_mm": disc.radius, "thickness_mm": 2 * disc.half_thickness}
-    remedies = tuple(Remedy(f"[disc] {key}", declared=f"{1e3 * size:g}") for key, size in sizes.items())
-    text = (
-        f"mass, radius and thickness give the disc a density of {1e-3 * found:.2g} g/cm³; expected 0.05 (foam) to 23 "
-        "(osmium)"
-    )
-    return (Finding(Kind.DENSITY, Severity.WARNING, text, remedies=remedies),)
+    if not 50.0 < found < 23e3:
+        sizes = {"mass_g": disc.mass, "radius_mm": disc.radius, "thickness_mm": 2 * disc.half_thickness}
+        remedies = tuple(Remedy(f"[disc] {key}", declared=f"{1e3 * size:g}") for key, size in sizes.items())
+        text = (
+            f"mass, radius and thickness give the disc a density of {1e-3 * found:.2g} g/cm³; expected 0.05 (foam) to "
+            "23 (osmium)"
+        )
+        yield Finding(Kind.DENSITY, Severity.WARNING, text, remedies=remedies)
 
 
 def balance(trajectory: Trajectory) -> tuple[Array, Array]:
@@ -441,8 +426,8 @@ def handedness(rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
     return (Finding(Kind.HANDEDNESS, Severity.DOUBT, text, remedies=remedies),)
 
 
-def scale_of_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]:
-    """Ratio of the triangulated distances of the dots to those of their declared centres."""
+def scale_of_dots(trajectory: Trajectory, declared: Disc, square: float | None) -> tuple[Finding, ...]:
+    """Ratio of the triangulated distances of the dots to those of their declared centres; square : of `other_scale`."""
     rows = np.flatnonzero(trajectory.measured)
     rows = rows[evenly(len(rows), 50)]
     good = (trajectory.marker_status[rows] == MarkerStatus.MEASURED).all(axis=1)
@@ -461,7 +446,7 @@ def scale_of_dots(trajectory: Trajectory, declared: Disc) -> tuple[Finding, ...]
     typical = _typical(per_pair)
     # pairs share dots: there are only as many independent distances as dots
     scale = replace(typical, sigma=max(typical.sigma * np.sqrt(len(per_pair) / dots), 1e-4))
-    return (other_scale(scale),) if _beyond(scale, 1.0, SCALE) else ()
+    return (other_scale(scale, square),) if _beyond(scale, 1.0, SCALE) else ()
 
 
 def other_scale(scale: Measured, square: float | None = None, explains: tuple[Kind, ...] = BY_SCALE) -> Finding:
@@ -507,11 +492,10 @@ def unseen_dots(trajectory: Trajectory, declared: Disc) -> Iterator[Finding]:
         yield Finding(Kind.DOT_UNSEEN, severity, text, Subject(dot=int(dot)), remedies=(remedy,))
 
 
-def turned_board(inner_corners: Sequence[int]) -> tuple[Finding, ...]:
+def turned_board(inner_corners: Sequence[int]) -> Iterator[Finding]:
     """Corners counted along the short side first rotate the axes of the table by 90 deg."""
     first, second = inner_corners
-    if first >= second:
-        return ()
-    remedy = Remedy("[calibration] inner_corners", f"[{second}, {first}]", f"[{first}, {second}]")
-    text = "corners are counted along the short side first, so that x runs along it; expected the long side first"
-    return (Finding(Kind.CORNERS, Severity.DOUBT, text, remedies=(remedy,)),)
+    if first < second:
+        remedy = Remedy("[calibration] inner_corners", f"[{second}, {first}]", f"[{first}, {second}]")
+        text = "corners are counted along the short side first, so that x runs along it; expected the long side first"
+        yield Finding(Kind.CORNERS, Severity.DOUBT, text, remedies=(remedy,))

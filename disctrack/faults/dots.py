@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.cameras.camera import Camera, StereoRig, by_turning, placed_at, project_with_jacobians
+from calibration.cameras.camera import Camera, StereoRig, by_turning, placed, project_with_jacobians
 from calibration.kit.arrays import Array
 from disctrack.disc import Disc
 from disctrack.faults.keys import Faults
@@ -29,16 +29,15 @@ def cameras_with(faults: Faults, rig: StereoRig) -> StereoRig:
     """
     tilt = rotation_from_vector(np.radians([*faults.table_turn_deg, 0.0]))
     lift = np.array([0.0, 0.0, 1e-3 * faults.table_height_mm])
-    cameras, poses = [], []
+    cameras = []
     for camera, (R, t), fault in zip(rig.cameras, rig.camera_poses(), (faults.left, faults.right), strict=True):
         turn = rotation_from_vector(np.radians(fault.rotation_deg)).T  # the image rotates opposite to the camera
-        poses.append((turn @ R @ tilt, turn @ (t + R @ lift - 1e-3 * np.array(fault.translation_mm))))
+        shifted = turn @ (t + R @ lift - 1e-3 * np.array(fault.translation_mm))
         parameters = camera.parameters
         parameters[:2] *= fault.focal_scale
         parameters[2:5] += [*fault.principal_point_change_px, fault.k1_change]
-        cameras.append(Camera.from_parameters(parameters, camera.image_size))
-    left, right = cameras
-    return replace(rig, left=left, right=right, **placed_at(poses))
+        cameras.append((Camera.from_parameters(parameters, camera.image_size), turn @ R @ tilt, shifted))
+    return replace(rig, **placed(cameras))
 
 
 @dataclass(frozen=True)

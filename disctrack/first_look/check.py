@@ -14,7 +14,7 @@ import numpy as np
 from calibration import StereoCalibration, StereoRig
 from calibration.kit.arrays import AnyArray, evenly
 from calibration.rig_file import record_of
-from disctrack.analyse.declaration import Boards, across, contradictions, lost_pairs, turned_board, with_square
+from disctrack.analyse.declaration import Boards, across, contradictions, lost_pairs, turned_board
 from disctrack.calibrate.stage import boards_in, boards_of, given_rig, noticed_in, source_of
 from disctrack.errors import DiscTrackError, RecordingError
 from disctrack.findings import Finding, Kind, Remedy, Severity, Subject, in_doubt, leading
@@ -170,7 +170,7 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
         total += n
         try:
             settings = TrackingSettings(first_pass=False, exposure=exposures(recording, pairs)[0])
-            taken = Taken(frames, recording.frame_rate, recording.gravity, settings=settings)
+            taken = Taken(frames, recording.frame_rate, recording.gravity, None, settings, recording.chessboard)
             tracking = track(pairs.reading(seen.not_read), taken, rig, recording.disc)
             done.append((frames, tracking))
             noticed += [*tracking.trajectory.findings, *lost_pairs(tracking.trajectory)]
@@ -183,7 +183,7 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
     noticed = _once(noticed)
     if not done:
         seen.add(Kind.DISC_NOT_FOUND, "the disc was found nowhere; compare [markers] with the picture", lost)
-        seen.findings += with_square(noticed, recording)
+        seen.findings += noticed
         return
     measured = sum(int(tracking.trajectory.measured.sum()) for _, tracking in done)
     if measured < total:

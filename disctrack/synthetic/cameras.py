@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibration.cameras.camera import Camera, StereoRig, placed_at, project
+from calibration.cameras.camera import Camera, StereoRig, placed, project
 from calibration.kit.arrays import Array
 from disctrack.errors import SceneError
 from disctrack.frames import rotation_from_vector
@@ -43,8 +43,7 @@ def all_inside(points_world: Array, rig: StereoRig, border_px: float) -> bool:
 def rig_of(scene: Scene) -> StereoRig:
     """The rig during its calibration, with the table as world."""
     rng = np.random.default_rng([scene.seed, 1])
-    left, right = (_camera(scene, index, rng) for index in (0, 1))
-    return StereoRig(left.camera, right.camera, **placed_at([left[1:], right[1:]]), world_is_table=True)
+    return StereoRig(**placed([_camera(scene, index, rng) for index in (0, 1)]), world_is_table=True)
 
 
 def _camera(scene: Scene, index: int, rng: np.random.Generator) -> View:

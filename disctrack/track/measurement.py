@@ -12,7 +12,7 @@ from calibration.cameras.camera import StereoRig
 from calibration.kit.arguments import FrameRate, Gravity, Threads, Times, checked, grey_values
 from calibration.kit.arrays import AnyArray
 from calibration.kit.threads import one_blas_thread
-from disctrack.analyse.declaration import Boards, contradictions, with_square
+from disctrack.analyse.declaration import Boards, contradictions
 from disctrack.disc import Disc
 from disctrack.errors import RecordingError, TrackingError
 from disctrack.files.json_text import json_sha256
@@ -142,8 +142,9 @@ def measure(
         prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)
     began = time.perf_counter()
     span = _span(pairs, recording.frame_rate, settings)
-    progress(len(pairs) - (span.stop - span.start))
-    taken = Taken(range(span.start, span.stop), recording.frame_rate, recording.gravity, stamps, settings)
+    frames = range(span.start, span.stop)
+    progress(len(pairs) - len(frames))
+    taken = Taken(frames, recording.frame_rate, recording.gravity, stamps, settings, recording.chessboard)
     found = _tracked(recording, rig, pairs, taken, threads or default_threads(), progress)
     seconds = time.perf_counter() - began
     findings = (
@@ -245,18 +246,16 @@ def _tracked(
         found = track(reading, taken, rig, recording.disc, workers, progress)
     except TrackingError as error:
         refuse_unreadable(recording, not_read, 2 * len(taken.pairs), error)
-        error.findings = with_square(error.findings, recording)
         raise
     return replace(found, unreadable=dict(sorted(not_read.items())))
 
 
-def images_lost(not_read: NotRead) -> tuple[Finding, ...]:
+def images_lost(not_read: NotRead) -> Iterator[Finding]:
     """Finding about images that could not be read."""
-    if not not_read:
-        return ()
-    n, where = len(not_read), "their frames rest on one camera or none"
-    text = f"{n} image{'s' * (n > 1)} could not be read; {where}. The first: {not_read[min(not_read)]}"
-    return (Finding(Kind.UNREADABLE, Severity.WARNING, text, explains=(Kind.FRAMES_LOST,)),)
+    if n := len(not_read):
+        where = "their frames rest on one camera or none"
+        text = f"{n} image{'s' * (n > 1)} could not be read; {where}. The first: {not_read[min(not_read)]}"
+        yield Finding(Kind.UNREADABLE, Severity.WARNING, text, explains=(Kind.FRAMES_LOST,))
 
 
 def refuse_unreadable(recording: Recording, lost: NotRead, n: int, error: TrackingError) -> None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import numpy as np
 
@@ -163,21 +163,24 @@ class Trajectory(Brief):
         return coordinate_sigma(self.q, self.calibration_covariance)
 
 
-def _changed(trajectory: Trajectory, change: Callable[[str, AnyArray], AnyArray]) -> Trajectory:
-    """Copy with `change` (name, array -> array) applied to all arrays, which have one row per frame."""
-    arrays = {name: value for name, value in vars(trajectory).items() if isinstance(value, np.ndarray)}
-    changed: dict[str, Any] = {name: change(name, value) for name, value in arrays.items()}
-    return replace(trajectory, **changed)
+Frames = TypeVar("Frames")  # a trajectory, or another dataclass of arrays that have one row per frame
 
 
-def part(trajectory: Trajectory, rows: slice) -> Trajectory:
-    """The trajectory of these frames only."""
-    return _changed(trajectory, lambda name, value: value[rows])
+def _changed(whole: Frames, change: Callable[[str, AnyArray], AnyArray]) -> Frames:
+    """Copy with `change` (name, array -> array) applied to all arrays."""
+    arrays = {name: change(name, value) for name, value in vars(whole).items() if isinstance(value, np.ndarray)}
+    return type(whole)(**vars(whole) | arrays)
 
 
-def joined(pieces: Sequence[Trajectory]) -> Trajectory:
-    """Successive parts of one recording as one trajectory; fields without frames are those of the first part."""
-    return _changed(pieces[0], lambda name, value: np.concatenate([vars(piece)[name] for piece in pieces]))
+def part(whole: Frames, rows: slice | Mask) -> Frames:
+    """These frames only."""
+    return _changed(whole, lambda name, value: value[rows])
+
+
+def joined(pieces: Iterable[Frames]) -> Frames:
+    """Successive parts as one; fields without frames are those of the first part."""
+    first, *others = pieces
+    return _changed(first, lambda name, value: np.concatenate([value, *(vars(piece)[name] for piece in others)]))
 
 
 def at_full_length(part: Trajectory, n: int, start: int, timestamps: Array | None = None) -> Trajectory:

@@ -7,7 +7,8 @@ import numpy as np
 from calibration.kit.arrays import Array
 from disctrack.analyse.declaration import CLAIM_POSITION
 from disctrack.frames import COORDINATES, POSE_COMPONENTS
-from disctrack.validate.rendered import EXPOSURE, STATIC, STRATA_DEG, PoseErrors, RenderedOutcome, joined
+from disctrack.trajectory import joined, part
+from disctrack.validate.rendered import EXPOSURE, STATIC, STRATA_DEG, PoseErrors, RenderedOutcome
 from disctrack.validate.tables import Validation, grouped, table
 
 PER_SI = {"µm": 1e6, "mdeg": 180e3 / np.pi}
@@ -27,15 +28,15 @@ class Accuracy:
         both = {name: [joined(errors) for errors in zip(*some, strict=True)] for name, some in pairs.items()}
         self.rows = {name: dict(_rows(*pair)) for name, pair in both.items()}
         static, noise = both[STATIC]
-        law = noise.part(noise.usable & (noise.q[:, 4] < np.radians(LAW_DEG)))
+        law = part(noise, noise.usable & (noise.q[:, 4] < np.radians(LAW_DEG)))
         # [mdeg] c of sigma(psi) = c / sin(theta)
         self.law = PER_SI["mdeg"] * _rms(law.angles[:, [0, 2]] * np.sin(law.q[:, 4])[:, None])
         # nutation [deg] below which two sigmas of psi and of phi exceed the claim
         self.law_limit_deg = float(np.degrees(np.arcsin(min(1.0, 2 * self.law / CLAIM["mdeg"]))))
         # by the number of cameras that see the upper face, and if both do, by nutation
         theta = np.degrees(static.q[:, 4])
-        self.sights = {str(n): _size(joined(o.own.part(o.cameras == n) for o in kinds[STATIC])) for n in (2, 1, 0)}
-        strata = {f"2, {a:g} to {b:g} deg": static.part((a <= theta) & (theta < b)) for a, b in STRATA_DEG}
+        self.sights = {str(n): _size(joined(part(o.own, o.cameras == n) for o in kinds[STATIC])) for n in (2, 1, 0)}
+        strata = {f"2, {a:g} to {b:g} deg": part(static, (a <= theta) & (theta < b)) for a, b in STRATA_DEG}
         self.sights |= {name: _size(some) for name, some in strata.items()}
         self.consistency = {f"noise, {name} (true cameras)": noise_consistency(e) for name, (_, e) in both.items()}
         of_calibration = calibration_consistency(pairs[STATIC])
@@ -50,7 +51,7 @@ def _rows(own: PoseErrors, true: PoseErrors) -> Iterator[tuple[str, Row]]:
     """Errors of each quantity: in total, and from noise and calibration, from the same images."""
     both = own.usable & true.usable
     for name in (*COORDINATES, "rotation"):
-        e, f = own.part(both).of(name), true.part(both).of(name)
+        e, f = part(own, both).of(name), part(true, both).of(name)
         n, e, f = len(e), *(values if values.size else np.array([np.nan]) for values in (e, f))
         unit, d = ("µm", e - f) if name in "xyz" else ("mdeg", np.angle(np.exp(1j * (e - f))))
         # noise : with the true cameras

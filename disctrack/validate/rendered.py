@@ -26,7 +26,7 @@ from disctrack.synthetic.cameras import all_inside, rig_of
 from disctrack.synthetic.description import GlareSettings, Scene
 from disctrack.synthetic.recording import Truth, run_render
 from disctrack.track.measurement import measure, open_pairs
-from disctrack.track.pose import MIN_DOTS
+from disctrack.track.pose import MIN_DOTS, dots_at
 from disctrack.trajectory import Trajectory, part
 from disctrack.validate.points import LABORATORY
 
@@ -77,19 +77,15 @@ class PoseErrors:
 
     def mean(self) -> tuple[Array, Array]:
         """Mean error (6,) of the usable poses, and the stated uncertainty of their common error (6,)."""
-        usable = self.part(self.usable)
+        usable = part(self, self.usable)
         variance = np.median(np.diagonal(usable.calibration_covariance, axis1=1, axis2=2), axis=0)
         return usable.error.mean(axis=0), np.sqrt(variance)
 
     def frame_to_frame(self) -> float:
         """Variance of the errors from their second differences, over the stated variance of the noise of a frame."""
-        usable = self.part(self.usable)
+        usable = part(self, self.usable)
         variances = np.diff(usable.error, 2, axis=0) ** 2 / 6.0
         return float(np.mean(variances / np.diagonal(usable.covariance, axis1=1, axis2=2)[1:-1]))
-
-    def part(self, rows: Mask) -> PoseErrors:
-        """The poses of these rows (n,)."""
-        return PoseErrors(*(values[rows] for values in vars(self).values()))
 
 
 def compare(trajectory: Trajectory, q_true: Array) -> PoseErrors:
@@ -99,11 +95,6 @@ def compare(trajectory: Trajectory, q_true: Array) -> PoseErrors:
     error = np.concatenate([trajectory.q[:, :3] - q_true[:, :3], vector_from_rotation(turn)], axis=1)
     angles = np.angle(np.exp(1j * (trajectory.q[:, 3:] - q_true[:, 3:])))
     return PoseErrors(q_true, error, angles, trajectory.pose_covariance, trajectory.calibration_covariance)
-
-
-def joined(parts: Iterable[PoseErrors]) -> PoseErrors:
-    """All poses of several comparisons."""
-    return PoseErrors(*map(np.concatenate, zip(*(vars(one).values() for one in parts), strict=True)))
 
 
 @dataclass(frozen=True)
@@ -121,7 +112,7 @@ class RenderedOutcome:
     @property
     def seen_by_both(self) -> tuple[PoseErrors, PoseErrors]:
         """Errors with the own calibration and with the true cameras, of poses in which both cameras see the face."""
-        return self.own.part(self.cameras == 2), self.true.part(self.cameras == 2)
+        return part(self.own, self.cameras == 2), part(self.true, self.cameras == 2)
 
 
 def scene_of(seed: int, quick: bool = False) -> Scene:
@@ -263,8 +254,7 @@ def cameras_in_sight(q: Array, rig: StereoRig, disc: Disc) -> AnyArray:
     above SMALLEST_SEMI_MINOR_PX.
     """
     R = rotation_from_euler(*q[:, 3:].T)
-    _, by_point, _ = rig.project_with_jacobians(disc.marker_centres_body @ np.swapaxes(R, 1, 2) + q[:, None, :3])
-    half_axes = 0.5 * disc.marker_diameter * by_point @ R[:, None, None, :, :2]  # of the ellipses, conjugate
+    half_axes = 0.5 * disc.marker_diameter * dots_at(R, q[:, :3], rig, disc)[1]  # of the ellipses, conjugate
     facing = np.linalg.det(half_axes) < 0  # y of the image points down
     semi_minor = facing * np.linalg.svd(half_axes, compute_uv=False)[..., 1]
     return np.sum(np.sum(semi_minor > SMALLEST_SEMI_MINOR_PX, axis=2) >= MIN_DOTS, axis=1)

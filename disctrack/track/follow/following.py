@@ -21,7 +21,7 @@ from disctrack.track.dots import _kernels as kernels
 from disctrack.track.dots.acquisition import Pose, acquire
 from disctrack.track.dots.template import Edge, NoiseModel, face_of, residual_noise, rough_noise
 from disctrack.track.pose import stacked
-from disctrack.trajectory import FrameStatus, MarkerStatus
+from disctrack.trajectory import FrameStatus, MarkerStatus, part
 
 # rms residual of a pair above which the disc is lost: a tenth of a dot, ten times that of a poor rig
 MAX_PREDICTION_RMS_PX = 2.0
@@ -73,10 +73,6 @@ class Tables:
     frame_status: Codes  # (n,)
     digest: AnyArray  # (n, 2) checksum of some rows of each image; 0 if there is no image
 
-    def part(self, rows: slice) -> Tables:
-        """Views of some rows."""
-        return Tables(*(value[rows] for value in vars(self).values()))
-
 
 @dataclass
 class Follower:
@@ -127,7 +123,7 @@ def empty_tables(n: int, m: int) -> Tables:
 def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tables, start: int) -> None:
     """Fill n rows of the tables, from `start` on; images (n, 2, height, width), readable (n, 2)."""
     n, i = len(images), 0
-    rows = tables.part(slice(start, start + n))
+    rows = part(tables, slice(start, start + n))  # views
     # a copy of an earlier image in one camera is a fault, as noise makes all images differ. If both cameras repeat,
     # the disc may be at rest: that is decided later, from the motion
     rows.digest[...] = np.where(readable, _digests(images), 0)
@@ -144,7 +140,7 @@ def follow_block(follower: Follower, images: Image, readable: Mask, tables: Tabl
             i += 1
             continue
         assert follower.heading is not None
-        done, follower.heading = run(follower, follower.heading, images[i:], readable[i:], rows.part(slice(i, None)))
+        done, follower.heading = run(follower, follower.heading, images[i:], readable[i:], part(rows, slice(i, None)))
         rows.frame_status[i : i + done] = FrameStatus.MEASURED
         if anew and done > 1:
             _go_back(follower, images, readable, rows, i)

@@ -27,7 +27,7 @@ from disctrack.track.judge.doubts import MOVED
 from disctrack.track.pose import DotsInFrames, fit_poses
 from disctrack.track.refine.assembly import Measurement, Taken, assemble
 from disctrack.track.side_by_side import evenly, stretches
-from disctrack.trajectory import FrameStatus, MarkerStatus
+from disctrack.trajectory import FrameStatus, MarkerStatus, part
 
 SHORTEST_SPLIT = 1000  # pairs; shorter stretches do not repay the search for the disc and the noise measurement
 # [m] displacement of a dot from its declared position above which all dots are located again. Wrong positions give the
@@ -75,7 +75,7 @@ def track(
         """With the dots expected at the positions of a disc."""
         followers, tables = _followed(read_blocks, edges, replace(begin, disc=expected), workers, progress)
         if not np.isfinite(tables.t).any():
-            raise _not_found(followers, pairs, why_not_seen(_some(read_blocks, pairs), rig, disc))
+            raise _not_found(followers, pairs, why_not_seen(_some(read_blocks, pairs), rig, disc, taken.board))
         return assemble([replace(follower, disc=disc) for follower in followers], tables, taken, workers)
 
     tracking = measured(disc, progress)
@@ -88,7 +88,7 @@ def track(
     if off > LOOK_AGAIN and not _faulty(tracking.trajectory.findings):
         tracking = measured(found, silent)
     noticed = (*dropped, *tracking.trajectory.findings)
-    arranged = why_not_seen(_conflicts(tracking, noticed, read_blocks, pairs), rig, disc)
+    arranged = why_not_seen(_conflicts(tracking, noticed, read_blocks, pairs), rig, disc, taken.board)
     return replace(tracking, trajectory=replace(tracking.trajectory, findings=(*arranged, *noticed, *stuck)))
 
 
@@ -185,7 +185,7 @@ def _followed(
         start, before = edges[k] - first, followers[k - 1]
         if _discontinuous(tables, start):  # another branch of phi was found: continue from the stretch before
             followers[k] = replace(before, lost=None, first_row=start)
-            stretch = tables.part(slice(start, edges[k + 1] - first))
+            stretch = part(tables, slice(start, edges[k + 1] - first))
             for name, empty in vars(empty_tables(1, begin.disc.n_markers)).items():
                 getattr(stretch, name)[...] = empty
             follow(k, silent)

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 import scipy
 
+from calibration.board.target import Board
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig, triangulate
 from calibration.kit.arrays import AnyArray, Array, Mask
 from disctrack.analyse.declaration import SIDE_TOLERANCE, other_scale
@@ -38,13 +39,13 @@ MISPLACED = 0.2  # relative error of distances between dots: measured with a rul
 MEETING_PX = 2 * acquisition.BLOB_PX  # misfit beyond which cameras or clocks contradict each other
 
 
-def why_not_seen(pairs: AnyArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
+def why_not_seen(pairs: AnyArray, rig: StereoRig, disc: Disc, board: Board | None) -> tuple[Finding, ...]:
     """The first explanation that holds, if any; pairs (n, 2, height, width) evenly spread over the recording."""
     few = pairs[:: max(1, len(pairs) // 2)][:2]
     explained = chain(
         (finding for pair in few for finding in arrangement_found(pair, rig, disc)),
         moved_camera(pairs, rig, disc),
-        (finding for pair in few for finding in unlike_declared(pair, rig, disc)),
+        (finding for pair in few for finding in unlike_declared(pair, rig, disc, board)),
     )
     return tuple(islice(explained, 1))
 
@@ -120,17 +121,17 @@ def _by_each_camera(pairs: AnyArray, rig: StereoRig, disc: Disc) -> DotsInFrames
     return DotsInFrames(rig, disc, pixels, covariance, R, t)
 
 
-def unlike_declared(pair: AnyArray, rig: StereoRig, disc: Disc) -> tuple[Finding, ...]:
+def unlike_declared(pair: AnyArray, rig: StereoRig, disc: Disc, board: Board | None = None) -> tuple[Finding, ...]:
     """Which declared number contradicts the images, and its value, if it can be determined.
 
-    pair : (2, height, width), images of the left and the right camera
+    pair : (2, height, width), images of the left and the right camera;  board : of the calibration
     """
     several = list(_seen_dots(pair, rig, disc))
     if not several:
         return ()
     which, points, _, scale, misfit_px = max(several, key=lambda found: found[0].sum())
     if abs(np.log(scale.value)) > SIDE_TOLERANCE:
-        return (other_scale(scale, explains=NONSENSE),)
+        return (other_scale(scale, None if board is None else board.square, NONSENSE),)
     (R,), (t,) = acquisition.rigid_motions(disc.marker_centres_body[None, which], points[None])
     # median of the searches: a search for blobs much smaller than the dots finds only their darkest parts
     (affine,) = dots_at(R[None], t[None], rig, disc)[1]

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from calibration.board.target import Board
 from calibration.cameras.camera import StereoRig, causes
 from calibration.kit.arrays import AnyArray, Array, Codes, Mask
 from calibration.kit.brief import Brief
@@ -23,7 +24,7 @@ from disctrack.track.refine.scatter import Scatter, scatter_of_poses, split_scat
 from disctrack.track.refine.self_calibration import AsBuilt, by_pattern, refine_as_built
 from disctrack.track.refine.table_contact import OF_PATTERN, off_centre, table_from_disc
 from disctrack.track.side_by_side import SHARED_FRAMES, evenly, parts
-from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory
+from disctrack.trajectory import FrameStatus, MarkerStatus, Trajectory, joined
 
 
 @dataclass(frozen=True)
@@ -57,13 +58,14 @@ class Measurement(Brief):
 
 @dataclass(frozen=True)
 class Taken:
-    """Which pairs are measured, their times, gravity, and the options."""
+    """Which pairs are measured, their times, gravity, the options, and the board of the calibration."""
 
     pairs: range
     frame_rate: float  # [Hz]
     gravity: float = 9.81  # [m/s^2]
     stamps: Array | None = None  # [s] of all frames, written by the camera
     settings: TrackingSettings = TrackingSettings()
+    board: Board | None = None  # as declared: its square may be wrong if the dots contradict it
 
     @property
     def time(self) -> Array:
@@ -178,8 +180,7 @@ def fit_all(seen: DotsInFrames, workers: int = 1, judged: bool = True) -> PoseFi
 
     # NumPy releases the GIL for large arrays: parts of some hundred frames run in parallel
     with ThreadPoolExecutor(workers, thread_name_prefix="part") as pool:
-        found = [vars(fits) for fits in pool.map(fitted, parts(max(len(seen.t), 1)))]
-    return PoseFits(**{name: np.concatenate([part[name] for part in found]) for name in found[0]})
+        return joined(pool.map(fitted, parts(max(len(seen.t), 1))))
 
 
 def _shared_sigma(fits: PoseFits, systematic: Array, rig: StereoRig, moved: Array) -> list[list[object]]:

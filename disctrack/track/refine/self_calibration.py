@@ -29,7 +29,7 @@ from calibration.judge.tolerances import SIZE
 from calibration.kit.arrays import Array
 from calibration.kit.least_squares import scaled_solve
 from disctrack.disc import Disc
-from disctrack.track.pose import DotsInFrames, PoseFits
+from disctrack.track.pose import DotsInFrames
 from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly
 
 DOT_SIGMA = 50e-6  # [m] prior sigma of a printed dot about its declared position: tens of micrometres are usual
@@ -103,10 +103,13 @@ def fit_shared(
     for iteration in range(ITERATIONS):
         frames, fits = frames.fitted(iteration > 0, shift)
         ok = fits.converged
-        reduced.append(float(fits.chi_square[ok].sum() / max(fits.degrees_of_freedom[ok].sum(), 1)))
+        chi_square, freedom = fits.chi_square[ok].sum(), max(int(fits.degrees_of_freedom[ok].sum()), 1)
+        reduced.append(float(chi_square / freedom))
         normal, gradient, _ = frames.normal(shift, fits.used, free)
-        # excess scatter of the dots over the image noise reduces their weight
-        scale = share / _residual_scatter(fits, normal, gradient)
+        # excess scatter of the dots over the image noise reduces their weight: that predicted after the best step, as
+        # before it dots declared at wrong positions look like a hundred times the noise, and would damp it
+        explained = gradient @ np.linalg.lstsq(normal, gradient, rcond=1e-12)[0]
+        scale = share / max(1.0, float(chi_square - explained) / freedom)
         matrix = scale * normal + information
         shift[free] += scaled_solve(matrix, scale * gradient - information @ shift[free])
     covariance = np.zeros((len(shift), len(shift)))
@@ -235,13 +238,3 @@ def _pattern_motions(disc: Disc) -> Array:
     motions = np.stack([np.stack([one, zero, -y], -1), np.stack([zero, one, x], -1)], axis=1)
     motions[..., 2] /= np.sqrt(np.mean(x * x + y * y))
     return motions
-
-
-def _residual_scatter(fits: PoseFits, normal: Array, gradient: Array) -> float:
-    """Reduced chi-square, at least 1, predicted after the best step of the shared parameters: the dots' scatter.
-
-    Before this step, dots declared at wrong positions look like a hundred times the noise, and would damp it.
-    """
-    chi_square, freedom = fits.chi_square[fits.converged].sum(), fits.degrees_of_freedom[fits.converged].sum()
-    explained = gradient @ np.linalg.lstsq(normal, gradient, rcond=1e-12)[0]
-    return max(1.0, float(chi_square - explained) / max(float(freedom), 1.0))

@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calibration.cameras.camera import Camera, StereoRig, normalise, placed_at, project_with_jacobians
+from calibration.cameras.camera import Camera, StereoRig, normalise, placed, project_with_jacobians
 from calibration.kit.arrays import Array
 from disctrack.errors import OutputError, RigFileError, told_as
 from disctrack.files.inputs import read_regular
@@ -26,12 +26,6 @@ from disctrack.frames import rotation_from_vector, vector_from_rotation
 Table = Mapping[str, Any]
 BROWN = ("k1", "k2", "p1", "p2", "k3")
 MAX_BYTES = 50_000_000  # of a file; mrcal stores the whole calibration in the file of a camera
-
-
-def rig_of(parts: Sequence[tuple[Camera, Array, Array]], world_is_table: bool) -> StereoRig:
-    """Rig from each camera with R (3, 3), t (3,) [m] from the reference to its axes, left first."""
-    (left, *_), (right, *_) = parts
-    return StereoRig(left, right, **placed_at([(R, t) for _, R, t in parts]), world_is_table=world_is_table)
 
 
 def camera_of(K: Array, D: Array, size: Array, where: str) -> Camera:
@@ -140,7 +134,7 @@ def read_caliscope(path: Path, *, cameras: tuple[str, str] | None = None, world_
             raise RigFileError(f"{where}: has no rotation: its place was not calibrated")
         R = rotation_of(array_of(table, "rotation", (-1,), where), where)
         parts.append((camera_of(K, D, size, where), R, array_of(table, "translation", (3,), where)))
-    return rig_of(parts, world_is_table)
+    return StereoRig(**placed(parts), world_is_table=world_is_table)
 
 
 # --- Kalibr's camchain YAML: cam0 (left), cam1 (right), pinholes with radtan or no distortion -------------------------
@@ -182,7 +176,7 @@ def read_kalibr(path: Path) -> StereoRig:
         D = array_of(table, "distortion_coeffs", (-1,), where) if lens == "radtan" else np.zeros(0)
         T = np.eye(4) if name == "cam0" else array_of(table, "T_cn_cnm1", (4, 4), where)
         parts.append((camera_of(K, D, size, where), rotation_of(T[:3, :3], where), T[:3, 3]))
-    return rig_of(parts, world_is_table=False)
+    return StereoRig(**placed(parts))
 
 
 # --- mrcal's .cameramodel, one file per camera, with Brown's lens model -----------------------------------------------
@@ -234,7 +228,7 @@ def read_mrcal(paths: Sequence[Path], *, world_is_table: bool = False) -> Stereo
         rt = array_of(model, "extrinsics" if "extrinsics" in model else "rt_cam_ref", (6,), str(path))
         camera = camera_of(_matrix(*numbers[:4]), numbers[4:], size, str(path))
         parts.append((camera, rotation_of(rt[:3], str(path)), rt[3:]))
-    return rig_of(parts, world_is_table)
+    return StereoRig(**placed(parts), world_is_table=world_is_table)
 
 
 # --- Direct linear transformation: the dltcoefs.csv of DLTdv8 and easyWand, a column of 11 numbers per camera ---------
@@ -275,7 +269,7 @@ def read_dlt(
         K, R, (*centre, scale) = cv2.decomposeProjectionMatrix(P)[:3]
         t = -R @ np.ravel(centre) / scale * unit
         parts.append((camera_of(K / K[2, 2], np.zeros(0), np.array(image_size), f"{path}, camera {number}"), R, t))
-    return rig_of(parts, world_is_table)
+    return StereoRig(**placed(parts), world_is_table=world_is_table)
 
 
 def _matrix(fx: float, fy: float, cx: float, cy: float) -> Array:

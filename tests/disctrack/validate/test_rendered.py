@@ -12,7 +12,7 @@ from disctrack.recording.declaration import read_recording
 from disctrack.synthetic.cameras import rig_of
 from disctrack.track.dots.template import NoiseModel
 from disctrack.track.measurement import measure, open_pairs
-from disctrack.trajectory import part
+from disctrack.trajectory import joined, part
 from disctrack.validate import accuracy as summary
 from disctrack.validate import rendered
 from disctrack.validate.tables import write_validation
@@ -46,7 +46,7 @@ def test_own_calibration_keeps_the_papers_claim_and_finds_every_pose_without_a_p
 @pytest.mark.statistical
 def test_covariances_are_honest(outcomes, accuracy):
     """Of 50 poses through the true cameras chance allows 1 +- 0.08; one rig has six degrees of freedom."""
-    pooled = summary.noise_consistency(rendered.joined(outcome.seen_by_both[1] for outcome in outcomes))
+    pooled = summary.noise_consistency(joined(outcome.seen_by_both[1] for outcome in outcomes))
     assert abs(pooled["value"] - 1) < 4 * pooled["standard error"]
     # chi-square / 6 exceeds 3.7 once in a thousand rigs
     assert next(c for name, c in accuracy.consistency.items() if name.startswith("calibration"))["value"] < 3.7
