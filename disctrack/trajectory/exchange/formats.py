@@ -20,7 +20,7 @@ from disctrack.errors import OutputError, TrajectoryFileError, told_as
 from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.exchange import arrays, motion, rigs
+from disctrack.trajectory.exchange import motion, rigs
 from disctrack.trajectory.exchange.rigs import BROWN, content_of, the_one, within_brown
 from disctrack.trajectory.file import read_trajectory, trajectory_in
 
@@ -49,7 +49,7 @@ SIGMAS = "sigmas but one of the place, the rig, the dots in the images"
 ROWS = (
     Format("table", (".csv",), "trajectory", partial(motion.write_csv, overwrite=True), None,
            "covariances, the rig, the dots"),
-    Format("MATLAB", (".mat",), "trajectory", arrays.write_mat, None, "the rig"),
+    Format("MATLAB", (".mat",), "trajectory", motion.write_mat, None, "the rig"),
     Format("C3D", (".c3d",), "trajectory", motion.write_c3d, None, SIGMAS),
     Format("TRC", (".trc",), "trajectory", motion.write_trc, None, "sigmas, the rig, the dots in the images"),
     Format("QTM", (".tsv",), "trajectory", motion.write_qtm, None, SIGMAS),
@@ -59,7 +59,7 @@ ROWS = (
            mark="_cam1_X"),
     Format("DLTdv8 points", ("xypts.csv",), "points", motion.write_xypts, motion.read_xypts, "sigmas, the lenses: the "
            "points are without their distortion, as dltcoefs.csv needs them", mark="pt1_cam1_X"),
-    Format("OpenCV", (".yml", ".yaml", ".xml"), "rig", arrays.write_opencv, arrays.read_opencv, "covariances"),
+    Format("OpenCV", (".yml", ".yaml", ".xml"), "rig", rigs.write_opencv, rigs.read_opencv, "covariances"),
     Format("Kalibr", ("camchain.yaml", "kalibr.yaml"), "rig", rigs.write_kalibr, rigs.read_kalibr,
            "covariances, the world frame", FOUR, mark="cam0:"),
     Format("Caliscope", (".toml",), "rig", rigs.write_caliscope, rigs.read_caliscope, "covariances"),
@@ -68,7 +68,7 @@ ROWS = (
     Format("mrcal", (".cameramodel",), "rig", rigs.write_mrcal, rigs.read_mrcal, "covariances"),
     Format("DLT", ("dltcoefs.csv",), "rig", rigs.write_dlt, rigs.read_dlt, "covariances, the lenses: they belong to "
            "points without distortion, those of xypts.csv", None),
-    Format("MATLAB stereoParameters", (".mat",), "rig", arrays.write_stereo_parameters, arrays.read_stereo_parameters,
+    Format("MATLAB stereoParameters", (".mat",), "rig", rigs.write_stereo_parameters, rigs.read_stereo_parameters,
            "covariances"),
 )  # fmt: skip
 
