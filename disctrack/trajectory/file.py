@@ -336,21 +336,11 @@ _LAYOUT: dict[str, tuple[str, tuple[str, ...], str, str]] = {
                                 "m or rad per unit of the parameter", "d pose / d rig parameter at fixed pixels"),
 }  # fmt: skip
 _FLAGS = {"frame_status": flags(FrameStatus), "marker_status": flags(MarkerStatus)}
-# Of the rig: variables with one row per camera, and axes of the other variables
+# Of the rig: variables with one row per camera
 _OF_CAMERAS = {
     "camera_matrix": (("camera", *_SPACE2), "px", "pinhole matrix K"),
     "distortion": (("camera", "distortion_coefficient"), "1", "Brown distortion on normalised coordinates"),
     "image_size_px": (("camera", "axis"), "px", "width, height"),
-}
-_RIG_AXES = {
-    "R_right_left": _SPACE2,
-    "t_right_left": ("space_axis",),
-    "R_left_world": _SPACE2,
-    "t_left_world": ("space_axis",),
-    "covariance": ("rig_parameter", "rig_parameter_2"),
-    "allowances": ("allowance", "rig_parameter"),
-    "lens_field": ("camera", "axis", "spline_y", "spline_x"),
-    "lens_field_spacing": (),
 }
 _COORDINATES = {
     "x": ("m", "position of the disc's centre along i"),
@@ -426,9 +416,8 @@ def _write_rig(group: h5py.Group, trajectory: Trajectory) -> None:
     }
     write_variables(group, variables | _variables(trajectory, "calibration"))
     for name, (data, row, attributes) in beside_cameras(rig).items():
-        dims = _RIG_AXES[name]
-        scales = {d: Variable(np.arange(n), (d,), "1", "index") for d, n in zip(dims, np.shape(data), strict=True)}
-        write_variables(group, {name: Variable(data, dims, row.units, row.description, attributes)}, scales)
+        scales = {d: Variable(np.arange(n), (d,), "1", "index") for d, n in zip(row.axes, np.shape(data), strict=True)}
+        write_variables(group, {name: Variable(data, row.axes, row.units, row.description, attributes)}, scales)
     group.attrs["world_is_table"] = np.uint8(rig.world_is_table)
     group.attrs["baseline_m"] = rig.baseline
 
