@@ -17,8 +17,7 @@ from disctrack.errors import DiscTrackError, OutputError, RecordingError
 from disctrack.files.toml_tree import read_toml
 from disctrack.files.whole import write_whole
 from disctrack.first_look.sequences import CameraPair, Sequence, find_sequences, pair_cameras
-from disctrack.recording.declaration import FILE_NAME
-from disctrack.recording.declaration_text import Told, declaration_text
+from disctrack.recording.declaration import FILE_NAME, Told, declaration_text
 from disctrack.recording.readers.base import FrameReader
 
 
