@@ -16,8 +16,7 @@ from calibration.rig_file import Record, complete_rig, read_rig, read_rig_file, 
 from disctrack.analyse.declaration import Boards
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views
 from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError
-from disctrack.files.inputs import keep, refuse_input
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import keep, refuse_input, write_whole
 from disctrack.findings import Finding, Kind, Severity, of_kind
 from disctrack.progress import compiling, progress_bar
 from disctrack.recording.declaration import Recording

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 from disctrack.calibrate.stage import calibrate_into, given_rig, source_of
 from disctrack.commands import _outputs as outputs
-from disctrack.files.inputs import refuse_input
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import refuse_input, write_whole
 from disctrack.recording.declaration import read_recording
 from disctrack.report.blocks import Facts, Section
 from disctrack.report.terminal import full

@@ -5,7 +5,7 @@ import argparse
 from disctrack.calibrate.stage import given_rig
 from disctrack.commands import _outputs as outputs
 from disctrack.errors import RecordingError
-from disctrack.files.inputs import refuse_input
+from disctrack.files.whole import refuse_input
 from disctrack.recording.declaration import read_recording
 from disctrack.track import measurement as pipeline
 

@@ -29,9 +29,8 @@ from disctrack.discrepancy.search import Diagnosis, Found, Settings
 from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import USED_UP
 from disctrack.errors import AnalysisError
-from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
-from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.files.whole import keep, refuse_existing, refuse_input, write_whole
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
 from disctrack.trajectory import Trajectory

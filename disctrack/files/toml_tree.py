@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from disctrack.errors import DiscTrackError, SceneError, told_as
-from disctrack.files.inputs import MOST_TEXT, read_regular
+from disctrack.files.whole import MOST_TEXT, read_regular
 
 MOST = 1e7  # of a number; lengths, angles, rates, grey values and frame counts of a laboratory are smaller
 NOT_NEGATIVE, POSITIVE = (0.0, MOST), (1 / MOST, MOST)  # the reciprocal of a positive number is within the limits, too

@@ -16,8 +16,8 @@ from calibration.kit.arguments import checked
 from calibration.kit.brief import Brief
 from disctrack.disc import AIR_DENSITY, STANDARD_PRESSURE, Disc, disc_from_mm
 from disctrack.errors import CalibrationError, RecordingError, told_as
-from disctrack.files.inputs import RECORDING_FILE, keep, why_not_regular
 from disctrack.files.toml_tree import read_toml, toml_value
+from disctrack.files.whole import RECORDING_FILE, keep, why_not_regular
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.base import Parts
 

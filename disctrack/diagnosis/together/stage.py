@@ -10,9 +10,8 @@ from disctrack.diagnosis.recorded import Recorded, read_recorded
 from disctrack.diagnosis.together.output import as_json, figures, report_of
 from disctrack.diagnosis.together.recordings import diagnose_together
 from disctrack.errors import AnalysisError, TrajectoryFileError
-from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
-from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.files.whole import keep, refuse_existing, refuse_input, write_whole
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
 from disctrack.trajectory.file import read_provenance

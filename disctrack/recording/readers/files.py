@@ -15,7 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from disctrack.errors import RecordingError, told_as
-from disctrack.files.inputs import MOST_IMAGE, keep, read_regular, why_not_regular
+from disctrack.files.whole import MOST_IMAGE, keep, read_regular, why_not_regular
 
 # Suffixes of each format, by the module whose function `open_MODULE`, (files, camera) -> FrameReader, reads it
 FORMATS = {

@@ -17,8 +17,7 @@ from calibration.kit.arguments import checked
 from calibration.rig_file import SCHEMA as RIG
 from calibration.rig_file import check_seal, read_rig, write_rig
 from disctrack.errors import OutputError, TrajectoryFileError, told_as
-from disctrack.files.inputs import keep, refuse_input
-from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.files.whole import keep, refuse_existing, refuse_input, write_whole
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.exchange import motion, rigs
 from disctrack.trajectory.exchange.rigs import BROWN, content_of, the_one, within_brown

@@ -20,9 +20,8 @@ import scipy
 from calibration.cameras.camera import Camera, StereoRig, normalise, placed_at, project_with_jacobians
 from calibration.kit.arrays import Array
 from disctrack.errors import OutputError, RigFileError, told_as
-from disctrack.files.inputs import read_regular
 from disctrack.files.toml_tree import MOST, toml_value
-from disctrack.files.whole import whole_file, write_whole
+from disctrack.files.whole import read_regular, whole_file, write_whole
 from disctrack.frames import rotation_from_vector, vector_from_rotation
 
 Table = Mapping[str, Any]
