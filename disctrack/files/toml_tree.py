@@ -8,7 +8,6 @@ import json
 import math
 import re
 import tomllib
-import types
 import typing
 from dataclasses import Field, field, fields, is_dataclass
 from difflib import get_close_matches
@@ -82,7 +81,7 @@ def _convert(hint: Any, value: Any, where: str, key: str, f: Field) -> Any:
         if not (least <= value <= most or not_given):
             raise SceneError(f"{where}: {key} = {value}; expected a number from {least:g} to {most:g}")
         return hint(value)
-    if isinstance(hint, type) and not isinstance(hint, types.GenericAlias) and type(value) is hint:
+    if type(value) is hint:
         return value
     wanted = getattr(hint, "__name__", str(hint)) if origin is None else f"a list ({hint})"
     raise SceneError(f"{where}: {key} = {value!r} is of the wrong kind; expected {wanted}")
