@@ -169,7 +169,8 @@ def write_whole(path: Path, content: bytes | memoryview, adds_to_input: bool = F
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Raise OutputError if `path` exists and may not be replaced."""
+    """Raise OutputError if `path` is an input (`refuse_input`), or exists and may not be replaced."""
+    refuse_input(path)
     if path.exists() and not overwrite:
         raise OutputError(f"{path}: exists. Choose another name or folder, or replace it with --overwrite.")
 

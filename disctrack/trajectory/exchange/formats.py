@@ -17,7 +17,7 @@ from calibration.kit.arguments import checked
 from calibration.rig_file import SCHEMA as RIG
 from calibration.rig_file import check_seal, read_rig, write_rig
 from disctrack.errors import OutputError, TrajectoryFileError, told_as
-from disctrack.files.whole import keep, refuse_existing, refuse_input, write_whole
+from disctrack.files.whole import keep, refuse_existing, write_whole
 from disctrack.trajectory import Trajectory
 from disctrack.trajectory.exchange import motion, rigs
 from disctrack.trajectory.exchange.rigs import BROWN, content_of, the_one, within_brown
@@ -104,7 +104,6 @@ def convert(
     for one in paths:
         keep(one)
     refuse_existing(path, overwrite)
-    refuse_input(path)
     stated = {name: value for name, value in stated.items() if value}
     if not (paths[0].suffix in OWN or h5py.is_hdf5(paths[0])):
         value = read_foreign(paths, **stated)
