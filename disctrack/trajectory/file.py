@@ -313,7 +313,6 @@ def _versions() -> dict[str, str]:
 # The file's layout: place, axes, unit and meaning of every array of a Trajectory
 _POSE2 = ("time", "pose_component", "pose_component_2")
 _DOTS = ("time", "camera", "marker", "axis")
-_SPACE2 = ("space_axis", "space_axis_2")
 _MIXED = "m and rad: m2, m rad, rad2"
 _LAYOUT: dict[str, tuple[str, tuple[str, ...], str, str]] = {
     "frame": ("frame", ("time",), "1", "number of the frame in its sequence"),
@@ -338,7 +337,7 @@ _LAYOUT: dict[str, tuple[str, tuple[str, ...], str, str]] = {
 _FLAGS = {"frame_status": flags(FrameStatus), "marker_status": flags(MarkerStatus)}
 # Of the rig: variables with one row per camera
 _OF_CAMERAS = {
-    "camera_matrix": (("camera", *_SPACE2), "px", "pinhole matrix K"),
+    "camera_matrix": (("camera", "space_axis", "space_axis_2"), "px", "pinhole matrix K"),
     "distortion": (("camera", "distortion_coefficient"), "1", "Brown distortion on normalised coordinates"),
     "image_size_px": (("camera", "axis"), "px", "width, height"),
 }

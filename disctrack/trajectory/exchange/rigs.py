@@ -286,7 +286,6 @@ def _matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
 # --- OpenCV's YAML, XML or JSON: the arguments of its functions under the names of its stereo sample, M1 D1 M2 D2 R T -
 
 _YAML = ("M1", "D1", "M2", "D2", "R", "T")
-_BESIDE = ("image_size1", "image_size2", "R_left_world", "t_left_world")
 
 
 def write_opencv(path: Path, rig: StereoRig) -> None:
@@ -344,7 +343,7 @@ def _nodes(path: Path) -> dict[str, Any]:
     found: dict[str, Any] = {}
     with told_as(RigFileError, f"{path}: not a stereo rig in OpenCV's YAML, XML or JSON format", Exception):
         storage = cv2.FileStorage(content_of(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        for name in (*_YAML, *_BESIDE):
+        for name in (*_YAML, "image_size1", "image_size2", "R_left_world", "t_left_world"):
             matrix = storage.getNode(name).mat()
             if matrix is not None:
                 found[name] = np.asarray(matrix, float)
