@@ -189,8 +189,13 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
 
 
-def check_writable(folder: Path) -> None:
-    """Create the folder and a temporary file in it, to detect errors before a long run. Raises OutputError."""
+def check_writable(folder: Path, *outputs: Path) -> None:
+    """Create the folder and a temporary file in it, to detect errors before a long run. Raises OutputError.
+
+    outputs : files that will be written there, of which none may be an input (`refuse_input`)
+    """
+    for path in outputs:
+        refuse_input(path)
     make_folder(folder)
     with writing(folder), tempfile.TemporaryFile(dir=folder):
         pass
