@@ -149,14 +149,7 @@ def calibrate_into(
         "doubts": found.doubts,
         "warnings": found.warnings,
     }
-    attributes = {
-        "fingerprint": provenance.fingerprint,
-        "inputs_sha256": json.dumps(dict(provenance.inputs)),
-        "settings": json.dumps(dict(provenance.settings)),
-        "software_version": provenance.version,
-        "summary": json.dumps(summarised),
-    }
-    write_whole(path, rig_bytes(found, attributes=attributes))
+    write_whole(path, rig_bytes(found, {**provenance.as_attributes(), "summary": json.dumps(summarised)}))
     files = [path]
     if figures:
         from disctrack.calibrate.figures import residuals_figure

@@ -77,6 +77,16 @@ class Provenance(Brief):
         """SHA-256 (hex) of inputs, settings and version."""
         return json_sha256({"inputs": dict(self.inputs), "settings": dict(self.settings), "version": self.version})
 
+    def as_attributes(self) -> dict[str, str]:
+        """Attributes of a file with such a result, for `read_provenance`; and the fingerprint."""
+        return {
+            "software_version": self.version,
+            "recording": self.recording,
+            "inputs_sha256": json.dumps(dict(self.inputs), sort_keys=True),
+            "settings": json.dumps(dict(self.settings), sort_keys=True),
+            "fingerprint": self.fingerprint,
+        }
+
 
 @checked
 def write_trajectory(
@@ -294,12 +304,8 @@ def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
         "software": "disctrack",
-        "software_version": provenance.version,
         "dependencies": json.dumps(_versions()),
-        "recording": provenance.recording,
-        "inputs_sha256": json.dumps(dict(provenance.inputs), sort_keys=True),
-        "settings": json.dumps(dict(provenance.settings), sort_keys=True),
-        "fingerprint": provenance.fingerprint,
+        **provenance.as_attributes(),
         **recording_numbers(trajectory),
         "table_moved_m_rad": trajectory.table_moved,
         **_CONVENTIONS,
