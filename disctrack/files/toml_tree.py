@@ -90,21 +90,18 @@ def _convert(hint: Any, value: Any, where: str, key: str, f: Field) -> Any:
 def toml_lines(settings: Any, name: str = "") -> list[str]:
     """Lines of a TOML file, or of its section `name`, that `build` reads back to an equal dataclass."""
     own, below = ([f"\n[{name}]"] if name else []), []
-    for f in fields(settings):
-        value = getattr(settings, f.name)
-        if isinstance(value, Path):
-            continue
+    for key, value in vars(settings).items():
         if is_dataclass(value):
-            below += toml_lines(value, f"{name}.{f.name}" if name else f.name)
-        else:
-            own.append(f"{f.name} = {toml_value(value)}")
+            below += toml_lines(value, f"{name}.{key}" if name else key)
+        elif not isinstance(value, Path):
+            own.append(f"{key} = {toml_value(value)}")
     return own + below
 
 
 def toml_value(value: Any) -> str:
     """A value as TOML writes it."""
     if is_dataclass(value):
-        value = {f.name: getattr(value, f.name) for f in fields(value)}
+        value = vars(value)
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, dict):
