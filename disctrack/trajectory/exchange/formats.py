@@ -137,8 +137,7 @@ def read_foreign(paths: Sequence[Path], **stated: Any) -> Any:
     if row is None or row.read is None:
         raise OutputError(f"{first}: no file of ours, and no format of this name is read; known are {_known(readable)}")
     accepted = signature(row.read).parameters
-    idle = [word for word in stated if word not in accepted]
-    if idle:
+    if idle := [word for word in stated if word not in accepted]:
         raise OutputError(f"{_options(idle)}: says nothing about {first} as {row.name}; leave it out")
     return row.read(paths if "paths" in accepted else the_one(paths), **stated)
 

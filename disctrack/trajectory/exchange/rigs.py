@@ -323,8 +323,7 @@ def read_opencv(
     for path in paths:
         nodes |= _nodes(path)
     where = ", ".join(str(p) for p in paths)
-    missing = [name for name in _YAML if name not in nodes]
-    if missing:
+    if missing := [name for name in _YAML if name not in nodes]:
         raise RigFileError(f"{where}: {', '.join(missing)} missing; a stereo rig has M1, D1, M2, D2, R and T")
     if unit is None and nodes["unit"] != "m":
         raise RigFileError(f"{where}: does not say in which unit T is; give it (0.025 for squares of 25 mm)")
