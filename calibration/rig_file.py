@@ -35,33 +35,37 @@ MAX_VALUES = 50_000_000  # of one dataset: with more, the file is no rig
 class Dataset(NamedTuple):
     """Description of a dataset of a rig file."""
 
-    shape: tuple[int | str, ...]  # a name is a size that is read from the file
+    axes: tuple[str, ...]
     units: str = ""
     description: str = ""
     kind: str = "f"  # of its values, as NumPy abbreviates it
 
 
+# Lengths of axes; those of others are free, or follow from the record
+_SIZES = {"camera": 2, "axis": 2, "space_axis": 3, "intrinsic_parameter": len(INTRINSIC_PARAMETERS)}
+_SIZES |= {"space_axis_2": 3, "rig_parameter": len(RIG_PARAMETERS), "rig_parameter_2": len(RIG_PARAMETERS)}
+_TURN = ("space_axis", "space_axis_2")
 _OF_CAMERA = {
-    "intrinsics": Dataset((len(INTRINSIC_PARAMETERS),), "px (first four), 1", ", ".join(INTRINSIC_PARAMETERS)),
-    "image_size": Dataset((2,), "px", "width, height", "iu"),
+    "intrinsics": Dataset(("intrinsic_parameter",), "px (first four), 1", ", ".join(INTRINSIC_PARAMETERS)),
+    "image_size": Dataset(("axis",), "px", "width, height", "iu"),
 }
 _BESIDE_CAMERAS = {
-    "R_right_left": Dataset((3, 3), "1", "rotation from left to right camera axes"),
-    "t_right_left": Dataset((3,), "m", "origin of the left camera in right camera axes"),
-    "R_left_world": Dataset((3, 3), "1", "rotation from world to left camera axes"),
-    "t_left_world": Dataset((3,), "m", "origin of the world in left camera axes"),
+    "R_right_left": Dataset(_TURN, "1", "rotation from left to right camera axes"),
+    "t_right_left": Dataset(("space_axis",), "m", "origin of the left camera in right camera axes"),
+    "R_left_world": Dataset(_TURN, "1", "rotation from world to left camera axes"),
+    "t_left_world": Dataset(("space_axis",), "m", "origin of the world in left camera axes"),
     "covariance": Dataset(
-        (len(RIG_PARAMETERS), len(RIG_PARAMETERS)),
+        ("rig_parameter", "rig_parameter_2"),
         "products of the units of the parameters (px, 1, rad, m)",
         "of the parameters named in `parameters`; rotation vectors multiply from the left; common to all frames",
     ),
     "allowances": Dataset(
-        ("causes", len(RIG_PARAMETERS)),
+        ("allowance", "rig_parameter"),
         "px, 1, rad, m",
         "parts of the covariance that no image tells, one row for one standard deviation of each cause",
     ),
     "lens_field": Dataset(
-        (2, 2, "rows", "columns"),
+        ("camera", "axis", "spline_y", "spline_x"),
         "px",
         "coefficients of cubic B-splines (camera, axis, y, x): displacement of image points beyond the polynomial",
     ),
@@ -69,20 +73,20 @@ _BESIDE_CAMERAS = {
 }
 _SELDOM = ("allowances", "lens_field", "lens_field_spacing")  # those that are optional
 _OF_RECORD = {
-    "board_points": Dataset(("points", 3), "m", "target points in board axes as refined"),
+    "board_points": Dataset(("points", "space_axis"), "m", "target points in board axes as refined"),
     "board_thickness": Dataset((), "m", "from the table to the printed face"),
     "unexplained_sigma": Dataset((), "px", "per axis, added to each corner's own noise"),
     "R_left_board": Dataset(
-        ("places", 3, 3), "1", "rotation from board to left camera axes, per place: views, then right images apart"
+        ("places", *_TURN), "1", "rotation from board to left camera axes, per place: views, then right images apart"
     ),
-    "t_left_board": Dataset(("places", 3), "m", "corner 0 in left camera axes, per place"),
+    "t_left_board": Dataset(("places", "space_axis"), "m", "corner 0 in left camera axes, per place"),
     "kept": Dataset(("seen",), "1", "1 where the corner was used", "u"),
-    "residuals": Dataset(("seen", 2), "px", "located minus predicted corner"),
+    "residuals": Dataset(("seen", "axis"), "px", "located minus predicted corner"),
     "view": Dataset(("seen",), "1", "index of the place", "iu"),
     "camera": Dataset(("seen",), "1", "0 left, 1 right", "iu"),
     "point": Dataset(("seen",), "1", "board point", "iu"),
-    "pixels": Dataset(("seen", 2), "px", "located corner"),
-    "pixels_covariance": Dataset(("seen", 2, 2), "px^2", "of the located corner, from the image's own noise"),
+    "pixels": Dataset(("seen", "axis"), "px", "located corner"),
+    "pixels_covariance": Dataset(("seen", "axis", "axis"), "px^2", "of the located corner, from the image's own noise"),
 }
 _TOLD = ("settings", "figures", "versions", "doubts", "warnings", "rejected_views", "rejected_corners")
 _IN_JSON = (*_TOLD, "board", "view_names", "apart")
@@ -99,13 +103,6 @@ Record = dict[str, Any]
 def record_of(calibration: StereoCalibration) -> Record:
     """The record of a calibration, without the images."""
     r = calibration.refinement
-    figures = {
-        "rms_px": calibration.rms_px,
-        "rms_per_camera_px": list(calibration.rms_per_camera_px),
-        "iterations": r.iterations,
-        "converged": r.converged,
-        "assessment": asdict(calibration.assessment),
-    }
     model, seen = r.model, r.observations
     apart = np.flatnonzero(model.apart)  # poses of the right images follow those of the views
     place = np.arange(len(model.apart))
@@ -113,7 +110,13 @@ def record_of(calibration: StereoCalibration) -> Record:
     R, t = (np.concatenate([of[:, 0], of[apart, 1]]) for of in (model.R_left_board, model.t_left_board))
     document = {
         "settings": {"tolerances": asdict(calibration.tolerances)},
-        "figures": figures,
+        "figures": {
+            "rms_px": calibration.rms_px,
+            "rms_per_camera_px": list(calibration.rms_per_camera_px),
+            "iterations": r.iterations,
+            "converged": r.converged,
+            "assessment": asdict(calibration.assessment),
+        },
         "versions": versions(("disctrack", "numpy", "scipy", "opencv-contrib-python-headless", "numba", "h5py")),
         **{name: getattr(calibration, name) for name in ("doubts", "warnings", "rejected_views", "view_names")},
         "rejected_corners": calibration.rejected_corners(),
@@ -196,9 +199,8 @@ def _seal(content: bytes | memoryview) -> bytes:
 
 def sealed(buffer: io.BytesIO) -> memoryview:
     """A file in memory, with the checksum of all its bytes appended."""
-    seal = _seal(buffer.getbuffer())
     buffer.seek(0, os.SEEK_END)
-    buffer.write(seal)
+    buffer.write(_seal(buffer.getbuffer()))
     return buffer.getbuffer()
 
 
@@ -335,14 +337,14 @@ def complete_file(
         ) from error
 
 
-def _get(group: h5py.Group, name: str, row: Dataset, sizes: Mapping[str, int] | None = None) -> AnyArray:
+def _get(group: h5py.Group, name: str, row: Dataset, sizes: Mapping[str, int] = {}) -> AnyArray:
     """A dataset, read after a check of its shape and kind against excessive sizes; unknown sizes are free."""
     if name not in group:
         raise RigFileError(f"{group.name}/{name} is missing; present: {', '.join(group)}")
     dataset = group[name]
     if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in row.kind:
         raise RigFileError(f"{group.name}/{name} does not hold numbers of the right kind")
-    shape = tuple((sizes or {}).get(n) if isinstance(n, str) else n for n in row.shape)
+    shape = tuple(map({**_SIZES, **sizes}.get, row.axes))
     same = len(dataset.shape) == len(shape) and all(w in (n, None) for n, w in zip(dataset.shape, shape, strict=True))
     if not same or dataset.size > MAX_VALUES:
         raise RigFileError(f"{group.name}/{name} has shape {dataset.shape}, expected {shape}")
@@ -388,8 +390,7 @@ def read_beside_cameras(group: h5py.Group, of_cameras: Iterable[Sequence[AnyArra
         if not len(causes) == len(assumed) == len(shifts):
             raise RigFileError(f"{group.name}/allowances: rows and causes do not match")
         values["allowances"] = tuple(map(Allowance, causes, shifts, assumed))
-    is_table = bool(group.attrs.get("world_is_table", 0))
-    return StereoRig(cameras[0], cameras[1], world_is_table=is_table, **values)
+    return StereoRig(cameras[0], cameras[1], world_is_table=bool(group.attrs.get("world_is_table", 0)), **values)
 
 
 def _read_record(group: h5py.Group) -> Record:

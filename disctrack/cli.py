@@ -78,7 +78,7 @@ def _run(argv: Sequence[str] | None) -> int:
         return USAGE
     if sys.stderr.isatty():  # the following imports take seconds
         print(f"{arguments.command} ...", end="\r", file=sys.stderr, flush=True)
-    from disctrack.files.inputs import inputs_kept  # late, so that --help is fast
+    from disctrack.files.whole import inputs_kept  # late, so that --help is fast
 
     command = importlib.import_module(f"disctrack.commands.{arguments.command.replace('-', '_')}")
     with inputs_kept(), catch_warnings():

@@ -93,12 +93,11 @@ def disc_from_mm(
 ) -> Disc:
     """Disc from the millimetres and grams of a recording.toml; centres are (n, 2) on the upper face."""
     centres = np.asarray(marker_centres_mm, float).reshape(-1, 2) * 1e-3
-    height = np.full(len(centres), thickness_mm * 0.5e-3)
     return Disc(
         radius=radius_mm * 1e-3,
         half_thickness=thickness_mm * 0.5e-3,
         mass=mass_g * 1e-3,
-        marker_centres_body=np.column_stack([centres, height]),
+        marker_centres_body=np.insert(centres, 2, thickness_mm * 0.5e-3, axis=1),
         marker_diameter=marker_diameter_mm * 1e-3,
         radius_tolerance=None if radius_tolerance_mm is None else radius_tolerance_mm * 1e-3,
         thickness_tolerance=None if thickness_tolerance_mm is None else thickness_tolerance_mm * 1e-3,

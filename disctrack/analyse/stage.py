@@ -16,9 +16,8 @@ from disctrack.analyse.power_laws import WINDOW
 from disctrack.analyse.quantities import QUANTITIES, DerivedSeries, Propagated
 from disctrack.analyse.report import report_of
 from disctrack.errors import AnalysisError
-from disctrack.files.inputs import keep
 from disctrack.files.labelled_arrays import Variable
-from disctrack.files.whole import refuse_existing
+from disctrack.files.whole import keep, refuse_existing
 from disctrack.frames import euler_jacobian
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page

@@ -28,8 +28,7 @@ from disctrack.files.text import csv_cell
 from disctrack.files.whole import check_writable, seen_from, write_whole
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.progress import progress_bar
-from disctrack.recording.declaration import FILE_NAME
-from disctrack.recording.declaration_text import changed_since
+from disctrack.recording.declaration import FILE_NAME, changed_since
 from disctrack.recording.readers.blocks import default_threads
 from disctrack.report.blocks import Report
 from disctrack.report.html import page

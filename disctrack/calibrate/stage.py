@@ -16,8 +16,7 @@ from calibration.rig_file import Record, complete_rig, read_rig, read_rig_file, 
 from disctrack.analyse.declaration import Boards
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views
 from disctrack.errors import CalibrationError, OutputError, RecordingError, RigFileError
-from disctrack.files.inputs import keep, refuse_input
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import keep, refuse_input, write_whole
 from disctrack.findings import Finding, Kind, Severity, of_kind
 from disctrack.progress import compiling, progress_bar
 from disctrack.recording.declaration import Recording
@@ -150,14 +149,7 @@ def calibrate_into(
         "doubts": found.doubts,
         "warnings": found.warnings,
     }
-    attributes = {
-        "fingerprint": provenance.fingerprint,
-        "inputs_sha256": json.dumps(dict(provenance.inputs)),
-        "settings": json.dumps(dict(provenance.settings)),
-        "software_version": provenance.version,
-        "summary": json.dumps(summarised),
-    }
-    write_whole(path, rig_bytes(found, attributes=attributes))
+    write_whole(path, rig_bytes(found, {**provenance.as_attributes(), "summary": json.dumps(summarised)}))
     files = [path]
     if figures:
         from disctrack.calibrate.figures import residuals_figure

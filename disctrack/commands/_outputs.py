@@ -15,8 +15,7 @@ from disctrack.files.whole import check_writable as check_writable
 from disctrack.files.whole import seen_from
 from disctrack.findings import Kind, Severity, in_doubt, leading, of_kind
 from disctrack.progress import progress_bar
-from disctrack.recording.declaration import FILE_NAME, Recording
-from disctrack.recording.declaration_text import changed_since
+from disctrack.recording.declaration import FILE_NAME, Recording, changed_since
 from disctrack.report.blocks import Facts, Report, document
 from disctrack.report.html import link_pages
 from disctrack.report.terminal import show

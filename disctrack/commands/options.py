@@ -109,17 +109,13 @@ def add_print(parser: argparse.ArgumentParser) -> None:
 
 def add_check(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack check`."""
-    _output_options(parser)
-    _file(parser, "recording", RECORDING)
-    _file(parser, "-o --output", "the picture (default: RECORDING/results/check.png)")
+    _recording_options(parser, "the picture (default: RECORDING/results/check.png)")
     _flag(parser, "--no-figures", "no picture")
 
 
 def add_run(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack run`."""
-    _output_options(parser)
-    _file(parser, "recording", RECORDING)
-    _file(parser, "-o --output", "folder for the results (default: RECORDING/results)")
+    _recording_options(parser, "folder for the results (default: RECORDING/results)")
     _tracking_options(parser)
 
 
@@ -142,10 +138,8 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
 
 def add_track(parser: argparse.ArgumentParser) -> None:
     """Arguments of `disctrack track`."""
-    _output_options(parser)
-    _file(parser, "recording", RECORDING)
+    _recording_options(parser, "trajectory file (default: RECORDING/results/trajectory.h5)")
     _file(parser, "--rig", "rig file (default: the recording's own, or results/rig.h5)")
-    _file(parser, "-o --output", "trajectory file (default: RECORDING/results/trajectory.h5)")
     _tracking_options(parser)
 
 
@@ -260,6 +254,13 @@ def add_validate(parser: argparse.ArgumentParser) -> None:
 
 def _last_seconds(parser: argparse.ArgumentParser, name: str, default: float, what: str) -> None:
     _value(parser, f"{name} S", _positive_number, f"{what} (default: %(default)s)", default=default)
+
+
+def _recording_options(parser: argparse.ArgumentParser, output: str) -> None:
+    """Common options of commands on one recording.   output : what they write"""
+    _output_options(parser)
+    _file(parser, "recording", RECORDING)
+    _file(parser, "-o --output", output)
 
 
 def _output_options(parser: argparse.ArgumentParser) -> None:

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 from disctrack.calibrate.stage import calibrate_into, given_rig, source_of
 from disctrack.commands import _outputs as outputs
-from disctrack.files.inputs import refuse_input
 from disctrack.files.whole import write_whole
 from disctrack.recording.declaration import read_recording
 from disctrack.report.blocks import Facts, Section
@@ -20,9 +19,7 @@ def run(arguments: argparse.Namespace) -> int:
     folder = arguments.output or recording.folder / outputs.RESULTS
     pairs = pipeline.open_pairs(recording, arguments.frames or (None, None))
     summary = folder / outputs.SUMMARY
-    for path in (folder / "trajectory.h5", summary):
-        refuse_input(path)
-    outputs.check_writable(folder)
+    outputs.check_writable(folder, folder / "trajectory.h5", summary)
     rig_file = recording.rig_file or folder / "rig.h5"
     if recording.rig_file is not None:
         rig, known = given_rig(rig_file)

@@ -5,7 +5,6 @@ import argparse
 from disctrack.calibrate.stage import given_rig
 from disctrack.commands import _outputs as outputs
 from disctrack.errors import RecordingError
-from disctrack.files.inputs import refuse_input
 from disctrack.recording.declaration import read_recording
 from disctrack.track import measurement as pipeline
 
@@ -22,6 +21,5 @@ def run(arguments: argparse.Namespace) -> int:
         )
     rig, _ = given_rig(rig_file)
     pairs = pipeline.open_pairs(recording, arguments.frames or (None, None))
-    refuse_input(path)
-    outputs.check_writable(path.parent)
+    outputs.check_writable(path.parent, path)
     return outputs.finish(outputs.track_into(path, recording, rig, rig_file, pairs, arguments), arguments, path.parent)

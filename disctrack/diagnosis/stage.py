@@ -29,9 +29,8 @@ from disctrack.discrepancy.search import Diagnosis, Found, Settings
 from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import USED_UP
 from disctrack.errors import AnalysisError
-from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file
-from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.files.whole import keep, refuse_existing, refuse_input, write_whole
 from disctrack.report.blocks import Report
 from disctrack.report.html import write_page
 from disctrack.trajectory import Trajectory
@@ -207,8 +206,7 @@ def run_diagnose(
     folder = Path(output) if output is not None else path.parent / f"{path.stem}_diagnosis"
     report, page, toml = (folder / name for name in ("diagnosis.json", "diagnosis.html", "model.toml"))
     refuse_existing(report, overwrite)
-    for file in (report, toml):
-        refuse_input(file)
+    refuse_input(toml)
     recorded, origin = read_recorded(path), origin_of(path, {"model": content_of(model), "plan": settle})
     try:
         result = diagnose(recorded.trajectory, model)

@@ -8,7 +8,6 @@ import json
 import math
 import re
 import tomllib
-import types
 import typing
 from dataclasses import Field, field, fields, is_dataclass
 from difflib import get_close_matches
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from disctrack.errors import DiscTrackError, SceneError, told_as
-from disctrack.files.inputs import MOST_TEXT, read_regular
+from disctrack.files.whole import MOST_TEXT, read_regular
 
 MOST = 1e7  # of a number; lengths, angles, rates, grey values and frame counts of a laboratory are smaller
 NOT_NEGATIVE, POSITIVE = (0.0, MOST), (1 / MOST, MOST)  # the reciprocal of a positive number is within the limits, too
@@ -82,7 +81,7 @@ def _convert(hint: Any, value: Any, where: str, key: str, f: Field) -> Any:
         if not (least <= value <= most or not_given):
             raise SceneError(f"{where}: {key} = {value}; expected a number from {least:g} to {most:g}")
         return hint(value)
-    if isinstance(hint, type) and not isinstance(hint, types.GenericAlias) and type(value) is hint:
+    if type(value) is hint:
         return value
     wanted = getattr(hint, "__name__", str(hint)) if origin is None else f"a list ({hint})"
     raise SceneError(f"{where}: {key} = {value!r} is of the wrong kind; expected {wanted}")
@@ -91,21 +90,18 @@ def _convert(hint: Any, value: Any, where: str, key: str, f: Field) -> Any:
 def toml_lines(settings: Any, name: str = "") -> list[str]:
     """Lines of a TOML file, or of its section `name`, that `build` reads back to an equal dataclass."""
     own, below = ([f"\n[{name}]"] if name else []), []
-    for f in fields(settings):
-        value = getattr(settings, f.name)
-        if isinstance(value, Path):
-            continue
+    for key, value in vars(settings).items():
         if is_dataclass(value):
-            below += toml_lines(value, f"{name}.{f.name}" if name else f.name)
-        else:
-            own.append(f"{f.name} = {toml_value(value)}")
+            below += toml_lines(value, f"{name}.{key}" if name else key)
+        elif not isinstance(value, Path):
+            own.append(f"{key} = {toml_value(value)}")
     return own + below
 
 
 def toml_value(value: Any) -> str:
     """A value as TOML writes it."""
     if is_dataclass(value):
-        value = {f.name: getattr(value, f.name) for f in fields(value)}
+        value = vars(value)
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, dict):

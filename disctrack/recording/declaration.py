@@ -1,10 +1,11 @@
-"""A recording on disk: a folder with `recording.toml`, read into frozen dataclasses in SI units."""
+"""A recording on disk: a folder with `recording.toml`, read into frozen dataclasses in SI units, written, compared."""
 
 from __future__ import annotations
 
 import difflib
+import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -15,8 +16,8 @@ from calibration.kit.arguments import checked
 from calibration.kit.brief import Brief
 from disctrack.disc import AIR_DENSITY, STANDARD_PRESSURE, Disc, disc_from_mm
 from disctrack.errors import CalibrationError, RecordingError, told_as
-from disctrack.files.inputs import RECORDING_FILE, keep, why_not_regular
-from disctrack.files.toml_tree import read_toml
+from disctrack.files.toml_tree import read_toml, toml_value
+from disctrack.files.whole import RECORDING_FILE, keep, why_not_regular
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.base import Parts
 
@@ -370,3 +371,80 @@ def _tolerances(calibration: Mapping[str, float], table: Mapping[str, float]) ->
     flatness, thickness = (None if length is None else length * 1e-3 for length in lengths)
     square, side = calibration.get("square_tolerance_mm"), calibration.get("square_mm")
     return BoardTolerances(None if square is None or side is None else square / side, flatness, thickness)
+
+
+# --- Its text, with remarks and with keys to fill in, and differences from another one ------------------------------
+
+HEADINGS = {  # of sections
+    "cameras": "frame i of the left and of the right must show the same instant",
+    "markers": "round dots on the upper face, all of one size",
+    "calibration": "synchronised views of a flat chessboard",
+    "table": "the lab frame: k up from the table, which is z = 0",
+}
+# Sections whose optional keys are also valid for another recording of the same disc and board
+ALIKE = ("disc", "calibration", "table")
+
+Told = dict[tuple[str, str], tuple[Any, str]]  # (section, key) -> value, None if not known; and a remark
+
+
+def declaration_text(
+    name: str, told: Told, known: Mapping[str, float], example: Mapping[str, Any]
+) -> tuple[str, tuple[str, ...]]:
+    """Text of the recording.toml, and the keys that are missing.
+
+    told : values of this recording;  known : values by key;  example : declaration with the same disc and board
+    """
+    lines = [
+        "# Lengths in mm, masses in g, times in s. Every key: disctrack/docs/recording-toml.md",
+        f"name = {toml_value(name)}",
+    ]
+    missing = []
+    by_rig = {"calibration", "table"} if ("calibration", "rig") in told else set()  # sections replaced by a rig file
+    for section in KEYS:
+        if section in by_rig - {"calibration"} or not section:
+            continue
+        rows = []
+        given = {} if section in by_rig else {**example.get(section, {}), **known}
+        for key, meant in KEYS[section].items():
+            alike = meant.needed or (section in ALIKE and key != "rig") or key == "exposure_us"
+            value, source = told.get((section, key), (given.get(key) if alike else None, ""))
+            if value is not None:
+                rows.append(_aligned(f"{key} = {toml_value(value)}", source or meant.remark))
+            elif meant.needed and section not in by_rig:
+                missing.append(f"[{section}] {key}")
+                rows.append(_aligned(f"# {key} = {meant.example}", f"FILL IN: {meant.remark}"))
+        lines += ["", _aligned(f"[{section}]", HEADINGS.get(section, "")), *rows] if rows else []
+    return "\n".join(lines) + "\n", tuple(missing)
+
+
+def _aligned(text: str, remark: str) -> str:
+    return f"{text:<31} # {remark}" if remark else text
+
+
+def changed_since(folder: Path, measured: Mapping[str, object]) -> str:
+    """Keys of the folder's recording.toml whose values have changed since the measurement.
+
+    measured : declaration stored in the trajectory file; empty if there is none
+    returns  : "[calibration] square_mm 6.1 (6.0 when it was measured)", separated by commas; empty if nothing has
+        changed, if `measured` is empty, or if the file cannot be read
+    """
+    try:
+        now = json.loads(json.dumps(read_toml(folder / FILE_NAME, RecordingError), default=str))
+    except (OSError, RecordingError):
+        return ""
+    return ", ".join(_differences(now, measured)) if measured else ""
+
+
+def _differences(now: Mapping[str, object], then: Mapping[str, object], section: str = "") -> Iterator[str]:
+    for key in dict.fromkeys([*then, *now]):
+        new, old = now.get(key), then.get(key)
+        if isinstance(new, dict) or isinstance(old, dict):
+            now_in, then_in = (item if isinstance(item, dict) else {} for item in (new, old))
+            yield from _differences(now_in, then_in, f"[{key}] ")
+        elif new != old:
+            yield f"{section}{key} {_stated(new)} ({_stated(old)} when it was measured)"
+
+
+def _stated(value: object) -> str:
+    text = "not declared" if value is None else json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."

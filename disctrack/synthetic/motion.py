@@ -104,8 +104,7 @@ def rolling_start(scene: Scene) -> State:
             )
         hit = [start.struck["lateral_mm"] * 1e-3, start.struck["vertical_mm"] * 1e-3, start.struck["impulse_N_s"]]
         return struck_disc(disc, *hit, friction=start.struck.get("friction", 0.0), psi=place["psi"]).moved(**place)
-    unknown = set(start.state) - set(State.__dataclass_fields__)
-    if unknown:
+    if unknown := set(start.state) - set(State.__dataclass_fields__):
         known = ", ".join(State.__dataclass_fields__)
         raise SceneError(f"motion.rolling.state: unknown {', '.join(sorted(unknown))}; a state has {known}")
     regular = steady_precession(

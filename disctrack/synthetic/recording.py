@@ -20,8 +20,7 @@ from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError, told_as
 from disctrack.faults.dots import cameras_with, centres_with, marker_pixels
 from disctrack.frames import COORDINATES, rotation_from_euler
-from disctrack.recording.declaration import KEYS
-from disctrack.recording.declaration_text import declaration_text
+from disctrack.recording.declaration import KEYS, declaration_text
 from disctrack.synthetic.cameras import board_poses, rig_of
 from disctrack.synthetic.description import ImperfectionSettings, Scene, scene_toml
 from disctrack.synthetic.images import expected_board_image, expected_disc_image, stages

@@ -11,10 +11,9 @@ import numpy as np
 from calibration.kit.arguments import checked
 from calibration.kit.brief import Brief
 from disctrack.errors import SceneError
-from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.labelled_arrays import Variable, flags, write_variables
 from disctrack.files.software import __version__
-from disctrack.files.whole import refuse_existing, whole_file
+from disctrack.files.whole import keep, refuse_existing, whole_file
 from disctrack.frames import continuous_quaternions, quaternion_from_rotation, rotation_from_euler
 from disctrack.rolling.motion import Motion
 from disctrack.rolling.records import Regime
@@ -58,7 +57,6 @@ def run_simulate(
     """
     scene_path, output = Path(scene_path), Path(output)
     keep(scene_path)
-    refuse_input(output)
     scene = load_scene(scene_path)
     if scene.motion.kind != "rolling":
         raise SceneError(

@@ -77,6 +77,16 @@ class Provenance(Brief):
         """SHA-256 (hex) of inputs, settings and version."""
         return json_sha256({"inputs": dict(self.inputs), "settings": dict(self.settings), "version": self.version})
 
+    def as_attributes(self) -> dict[str, str]:
+        """Attributes of a file with such a result, for `read_provenance`; and the fingerprint."""
+        return {
+            "software_version": self.version,
+            "recording": self.recording,
+            "inputs_sha256": json.dumps(dict(self.inputs), sort_keys=True),
+            "settings": json.dumps(dict(self.settings), sort_keys=True),
+            "fingerprint": self.fingerprint,
+        }
+
 
 @checked
 def write_trajectory(
@@ -294,12 +304,8 @@ def _root_attributes(trajectory: Trajectory, provenance: Provenance) -> dict[str
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
         "software": "disctrack",
-        "software_version": provenance.version,
         "dependencies": json.dumps(_versions()),
-        "recording": provenance.recording,
-        "inputs_sha256": json.dumps(dict(provenance.inputs), sort_keys=True),
-        "settings": json.dumps(dict(provenance.settings), sort_keys=True),
-        "fingerprint": provenance.fingerprint,
+        **provenance.as_attributes(),
         **recording_numbers(trajectory),
         "table_moved_m_rad": trajectory.table_moved,
         **_CONVENTIONS,
@@ -313,7 +319,6 @@ def _versions() -> dict[str, str]:
 # The file's layout: place, axes, unit and meaning of every array of a Trajectory
 _POSE2 = ("time", "pose_component", "pose_component_2")
 _DOTS = ("time", "camera", "marker", "axis")
-_SPACE2 = ("space_axis", "space_axis_2")
 _MIXED = "m and rad: m2, m rad, rad2"
 _LAYOUT: dict[str, tuple[str, tuple[str, ...], str, str]] = {
     "frame": ("frame", ("time",), "1", "number of the frame in its sequence"),
@@ -336,21 +341,11 @@ _LAYOUT: dict[str, tuple[str, tuple[str, ...], str, str]] = {
                                 "m or rad per unit of the parameter", "d pose / d rig parameter at fixed pixels"),
 }  # fmt: skip
 _FLAGS = {"frame_status": flags(FrameStatus), "marker_status": flags(MarkerStatus)}
-# Of the rig: variables with one row per camera, and axes of the other variables
+# Of the rig: variables with one row per camera
 _OF_CAMERAS = {
-    "camera_matrix": (("camera", *_SPACE2), "px", "pinhole matrix K"),
+    "camera_matrix": (("camera", "space_axis", "space_axis_2"), "px", "pinhole matrix K"),
     "distortion": (("camera", "distortion_coefficient"), "1", "Brown distortion on normalised coordinates"),
     "image_size_px": (("camera", "axis"), "px", "width, height"),
-}
-_RIG_AXES = {
-    "R_right_left": _SPACE2,
-    "t_right_left": ("space_axis",),
-    "R_left_world": _SPACE2,
-    "t_left_world": ("space_axis",),
-    "covariance": ("rig_parameter", "rig_parameter_2"),
-    "allowances": ("allowance", "rig_parameter"),
-    "lens_field": ("camera", "axis", "spline_y", "spline_x"),
-    "lens_field_spacing": (),
 }
 _COORDINATES = {
     "x": ("m", "position of the disc's centre along i"),
@@ -426,9 +421,8 @@ def _write_rig(group: h5py.Group, trajectory: Trajectory) -> None:
     }
     write_variables(group, variables | _variables(trajectory, "calibration"))
     for name, (data, row, attributes) in beside_cameras(rig).items():
-        dims = _RIG_AXES[name]
-        scales = {d: Variable(np.arange(n), (d,), "1", "index") for d, n in zip(dims, np.shape(data), strict=True)}
-        write_variables(group, {name: Variable(data, dims, row.units, row.description, attributes)}, scales)
+        scales = {d: Variable(np.arange(n), (d,), "1", "index") for d, n in zip(row.axes, np.shape(data), strict=True)}
+        write_variables(group, {name: Variable(data, row.axes, row.units, row.description, attributes)}, scales)
     group.attrs["world_is_table"] = np.uint8(rig.world_is_table)
     group.attrs["baseline_m"] = rig.baseline
 

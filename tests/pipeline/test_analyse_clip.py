@@ -11,7 +11,7 @@ import pytest
 
 import disctrack
 from disctrack.cli import main
-from disctrack.recording.declaration_text import changed_since
+from disctrack.recording.declaration import changed_since
 from disctrack.trajectory.file import read_group
 from tests.pipeline.conftest import QUICK
 

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from disctrack.cli import main
 from disctrack.commands.options import PAPERS
 from disctrack.disc import MA_2014
-from disctrack.first_look.sequences import find_sequences, pair_cameras
+from disctrack.first_look.declare import find_sequences, pair_cameras
 from disctrack.first_look.targets import PAPERS_MM, board_figure, dots_figure
 from tests.calibration.test_chessboard import located
 from tests.disctrack.batch.test_queue import touched

@@ -14,7 +14,7 @@ from disctrack import find_views, open_pairs, read_recording, read_trajectory
 from disctrack.calibrate.views import declared_views
 from disctrack.cli import main
 from disctrack.errors import RecordingError
-from disctrack.first_look.sequences import Sequence, pair_cameras
+from disctrack.first_look.declare import Sequence, pair_cameras
 from disctrack.recording.readers.base import cut_out
 from disctrack.trajectory import part
 from disctrack.trajectory.file import read_details

@@ -19,9 +19,8 @@ from disctrack.discrepancy.joint.together import Bound, Dependence, OfRecording,
 from disctrack.discrepancy.search import Diagnosis
 from disctrack.discrepancy.system import Quantity
 from disctrack.errors import AnalysisError, TrajectoryFileError
-from disctrack.files.inputs import keep, refuse_input
 from disctrack.files.json_text import json_file, plain
-from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.files.whole import keep, refuse_existing, write_whole
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.numbers import Measured, in_unit, measured, probability, rounded
 from disctrack.report.blocks import Drawn, Facts, Figures, Listing, Report, Section
@@ -71,7 +70,6 @@ def run_together(
     if reuse and (earlier := reusable(folder, origin)) is not None:
         return earlier
     refuse_existing(report, overwrite)
-    refuse_input(report)
     names = [r.name for r in read.values()]
     recordings = [  # of the same name are named by their files
         replace(r, name=p.resolve().relative_to(common).as_posix()) if names.count(r.name) > 1 else r

@@ -15,7 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from disctrack.errors import RecordingError, told_as
-from disctrack.files.inputs import MOST_IMAGE, keep, read_regular, why_not_regular
+from disctrack.files.whole import MOST_IMAGE, keep, read_regular, why_not_regular
 
 # Suffixes of each format, by the module whose function `open_MODULE`, (files, camera) -> FrameReader, reads it
 FORMATS = {
@@ -157,8 +157,7 @@ def _numbers_by_pattern(files: Sequence[Path], pattern: str) -> list[int]:
     )
     form = re.compile(f"(?s:{before}(?<![0-9])([0-9]+)(?![0-9]){after})\\Z")
     matches = [form.match(file.name) for file in files]
-    odd = [file for file, match in zip(files, matches, strict=True) if match is None]
-    if odd:
+    if odd := [file for file, match in zip(files, matches, strict=True) if match is None]:
         raise RecordingError(f"{_listed(odd)}: no number where {pattern} has {NUMBER}. Correct the pattern.")
     return [int(match[1]) for match in matches if match is not None]
 

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from disctrack.errors import RecordingError, told_as
-from disctrack.files.inputs import MOST_TEXT
+from disctrack.files.whole import MOST_TEXT
 from disctrack.recording.readers.base import CameraHeader, FrameReader, only_file, refuse_colour
 from disctrack.recording.readers.files import content_of
 from disctrack.recording.readers.raw import PixelLayout, RawFile, bit_depth_of, check_frame_size, raw_frames

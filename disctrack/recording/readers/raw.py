@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from calibration.kit.arrays import AnyArray, Image
 from disctrack.errors import RecordingError, told_as
-from disctrack.files.inputs import open_regular
+from disctrack.files.whole import open_regular
 from disctrack.recording.readers._pixel_kernels import unpack
 from disctrack.recording.readers.base import FrameReader, in_words, room_for
 

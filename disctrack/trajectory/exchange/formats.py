@@ -17,10 +17,9 @@ from calibration.kit.arguments import checked
 from calibration.rig_file import SCHEMA as RIG
 from calibration.rig_file import check_seal, read_rig, write_rig
 from disctrack.errors import OutputError, TrajectoryFileError, told_as
-from disctrack.files.inputs import keep, refuse_input
-from disctrack.files.whole import refuse_existing, write_whole
+from disctrack.files.whole import keep, refuse_existing, write_whole
 from disctrack.trajectory import Trajectory
-from disctrack.trajectory.exchange import arrays, motion, rigs
+from disctrack.trajectory.exchange import motion, rigs
 from disctrack.trajectory.exchange.rigs import BROWN, content_of, the_one, within_brown
 from disctrack.trajectory.file import read_trajectory, trajectory_in
 
@@ -49,7 +48,7 @@ SIGMAS = "sigmas but one of the place, the rig, the dots in the images"
 ROWS = (
     Format("table", (".csv",), "trajectory", partial(motion.write_csv, overwrite=True), None,
            "covariances, the rig, the dots"),
-    Format("MATLAB", (".mat",), "trajectory", arrays.write_mat, None, "the rig"),
+    Format("MATLAB", (".mat",), "trajectory", motion.write_mat, None, "the rig"),
     Format("C3D", (".c3d",), "trajectory", motion.write_c3d, None, SIGMAS),
     Format("TRC", (".trc",), "trajectory", motion.write_trc, None, "sigmas, the rig, the dots in the images"),
     Format("QTM", (".tsv",), "trajectory", motion.write_qtm, None, SIGMAS),
@@ -59,7 +58,7 @@ ROWS = (
            mark="_cam1_X"),
     Format("DLTdv8 points", ("xypts.csv",), "points", motion.write_xypts, motion.read_xypts, "sigmas, the lenses: the "
            "points are without their distortion, as dltcoefs.csv needs them", mark="pt1_cam1_X"),
-    Format("OpenCV", (".yml", ".yaml", ".xml"), "rig", arrays.write_opencv, arrays.read_opencv, "covariances"),
+    Format("OpenCV", (".yml", ".yaml", ".xml"), "rig", rigs.write_opencv, rigs.read_opencv, "covariances"),
     Format("Kalibr", ("camchain.yaml", "kalibr.yaml"), "rig", rigs.write_kalibr, rigs.read_kalibr,
            "covariances, the world frame", FOUR, mark="cam0:"),
     Format("Caliscope", (".toml",), "rig", rigs.write_caliscope, rigs.read_caliscope, "covariances"),
@@ -68,7 +67,7 @@ ROWS = (
     Format("mrcal", (".cameramodel",), "rig", rigs.write_mrcal, rigs.read_mrcal, "covariances"),
     Format("DLT", ("dltcoefs.csv",), "rig", rigs.write_dlt, rigs.read_dlt, "covariances, the lenses: they belong to "
            "points without distortion, those of xypts.csv", None),
-    Format("MATLAB stereoParameters", (".mat",), "rig", arrays.write_stereo_parameters, arrays.read_stereo_parameters,
+    Format("MATLAB stereoParameters", (".mat",), "rig", rigs.write_stereo_parameters, rigs.read_stereo_parameters,
            "covariances"),
 )  # fmt: skip
 
@@ -105,7 +104,6 @@ def convert(
     for one in paths:
         keep(one)
     refuse_existing(path, overwrite)
-    refuse_input(path)
     stated = {name: value for name, value in stated.items() if value}
     if not (paths[0].suffix in OWN or h5py.is_hdf5(paths[0])):
         value = read_foreign(paths, **stated)
@@ -139,8 +137,7 @@ def read_foreign(paths: Sequence[Path], **stated: Any) -> Any:
     if row is None or row.read is None:
         raise OutputError(f"{first}: no file of ours, and no format of this name is read; known are {_known(readable)}")
     accepted = signature(row.read).parameters
-    idle = [word for word in stated if word not in accepted]
-    if idle:
+    if idle := [word for word in stated if word not in accepted]:
         raise OutputError(f"{_options(idle)}: says nothing about {first} as {row.name}; leave it out")
     return row.read(paths if "paths" in accepted else the_one(paths), **stated)
 

@@ -17,7 +17,8 @@ from disctrack.errors import OutputError, RigFileError, told_as
 from disctrack.files.whole import refuse_existing, whole_file, write_whole
 from disctrack.frames import CAMERAS, COORDINATES, rotation_from_quaternion
 from disctrack.trajectory import FrameStatus, Trajectory
-from disctrack.trajectory.exchange.rigs import content_of
+from disctrack.trajectory.exchange.rigs import content_of, save_mat
+from disctrack.trajectory.file import disc_sizes, labelled, recording_numbers
 
 
 def body_points(trajectory: Trajectory) -> tuple[Array, list[str]]:
@@ -175,6 +176,28 @@ def write_transformations(path: Path, trajectory: Trajectory) -> None:
 _TRANSFORMATION = (
     "R11", "R12", "R13", "01", "R21", "R22", "R23", "02", "R31", "R32", "R33", "03", "TX", "TY", "TZ", "1"
 )  # fmt: skip
+
+
+def write_mat(path: Path, trajectory: Trajectory) -> None:
+    """Write all variables of the trajectory file's root and of the dots, in SI and radians; NaN for missing values.
+
+    disctrack.q (n, 6) with disctrack.q_names, q_sigma (this frame's noise), q_sigma_calibration (common to all frames);
+    disctrack.units holds the unit of every field. Raises OutputError.
+    """
+    variables = labelled(trajectory)
+    content = {
+        "time": trajectory.time,
+        "q": trajectory.q,
+        "q_sigma": trajectory.coordinate_sigma,
+        "q_sigma_calibration": trajectory.calibration_sigma,
+        "q_names": np.array(COORDINATES, dtype=object),
+        **{name: np.asarray(item.data) for name, item in variables.items()},
+        "status_names": np.array([status.name.lower() for status in FrameStatus], dtype=object),
+        **recording_numbers(trajectory),
+        "disc": {**disc_sizes(trajectory.disc), "marker_centres_body_m": trajectory.disc.marker_centres_body},
+        "units": {"time": "s", "q": "m, m, m, rad, rad, rad"} | {name: item.units for name, item in variables.items()},
+    }
+    save_mat(path, {"disctrack": content})
 
 
 # --- Image points as tables of text: a row for each frame, columns NAME_camJ_X, NAME_camJ_Y of every point and camera -

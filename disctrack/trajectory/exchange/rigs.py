@@ -1,4 +1,4 @@
-"""Rigs from and to formats with one table per camera: intrinsics, and pose relative to a common reference.
+"""Rigs from and to formats of other programs.
 
 All use x_camera = R x_reference + t, and pixel (0, 0) is the centre of the top-left pixel, as here, unless their
 section says otherwise. None stores the covariance: a rig that is read has none, and the sigmas of poses measured with
@@ -6,6 +6,7 @@ it are without the uncertainty of the calibration.
 """
 
 import ast
+import io
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,13 +15,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+import scipy
 
 from calibration.cameras.camera import Camera, StereoRig, normalise, placed, project_with_jacobians
 from calibration.kit.arrays import Array
 from disctrack.errors import OutputError, RigFileError, told_as
-from disctrack.files.inputs import read_regular
 from disctrack.files.toml_tree import MOST, toml_value
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import read_regular, whole_file, write_whole
 from disctrack.frames import rotation_from_vector, vector_from_rotation
 
 Table = Mapping[str, Any]
@@ -274,6 +275,154 @@ def read_dlt(
 
 def _matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+# --- OpenCV's YAML, XML or JSON: the arguments of its functions under the names of its stereo sample, M1 D1 M2 D2 R T -
+
+_YAML = ("M1", "D1", "M2", "D2", "R", "T")
+
+
+def write_opencv(path: Path, rig: StereoRig) -> None:
+    """Write intrinsics and extrinsics; lengths in metres. Raises OutputError.
+
+    M1 D1 M2 D2 R T are arguments of cv2.stereoRectify; R_left_world and t_left_world define the world frame.
+    """
+    with whole_file(path, suffix=path.suffix) as part:
+        storage = cv2.FileStorage(str(part), cv2.FILE_STORAGE_WRITE)
+        if not storage.isOpened():
+            raise OutputError(f"{path}: the rig cannot be written there")
+        storage.write("unit", "m")
+        sizes = {f"image_size{c}": np.array([camera.image_size], np.int32) for c, camera in enumerate(rig.cameras, 1)}
+        for name, number in (_numbers(rig, _YAML) | sizes).items():
+            storage.write(name, number)
+        storage.release()
+
+
+def read_opencv(
+    paths: Sequence[Path],
+    *,
+    image_size: tuple[int, int] | None = None,
+    unit: float | None = None,
+    world_is_table: bool = False,
+) -> StereoRig:
+    """A rig from one file, or from two (intrinsics.yml and extrinsics.yml of OpenCV's sample).
+
+    image_size : (width, height) [px], needed if the files do not contain it
+    unit : [m] length of the file's unit (0.025 if T is in squares of 25 mm); default: metres if the file says so
+    world_is_table : True if R_left_world and t_left_world are those of the table, k up, whatever the file says
+
+    The covariance is zero, as such files contain none. Raises RigFileError.
+    """
+    nodes: dict[str, Any] = {"unit": "", "world_is_table": False}
+    for path in paths:
+        nodes |= _nodes(path)
+    where = ", ".join(str(p) for p in paths)
+    if missing := [name for name in _YAML if name not in nodes]:
+        raise RigFileError(f"{where}: {', '.join(missing)} missing; a stereo rig has M1, D1, M2, D2, R and T")
+    if unit is None and nodes["unit"] != "m":
+        raise RigFileError(f"{where}: does not say in which unit T is; give it (0.025 for squares of 25 mm)")
+    sizes = [nodes.get(f"image_size{number}", np.array(image_size or (), float)).ravel() for number in (1, 2)]
+    if any(size.size != 2 for size in sizes):
+        raise RigFileError(f"{where}: does not tell the image size; give width and height")
+    if not {"R_left_world", "t_left_world"} <= nodes.keys():
+        if world_is_table:
+            raise RigFileError(f"{where}: without R_left_world and t_left_world nothing says where the table is")
+        nodes = {name: nodes[name] for name in _YAML}
+    return _stereo_rig(nodes, _YAML, sizes, 1.0 if unit is None else unit, world_is_table, where)
+
+
+def _nodes(path: Path) -> dict[str, Any]:
+    """Entries of a file that belong to a rig. Raises RigFileError."""
+    found: dict[str, Any] = {}
+    with told_as(RigFileError, f"{path}: not a stereo rig in OpenCV's YAML, XML or JSON format", Exception):
+        storage = cv2.FileStorage(content_of(path), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        for name in (*_YAML, "image_size1", "image_size2", "R_left_world", "t_left_world"):
+            matrix = storage.getNode(name).mat()
+            if matrix is not None:
+                found[name] = np.asarray(matrix, float)
+        if storage.getNode("unit").string() == "m":
+            found["unit"] = "m"
+        if storage.getNode("world_is_table").real() == 1.0:
+            found["world_is_table"] = True
+    return found
+
+
+# --- MAT files of version 5, for MATLAB and Octave: the arguments of MATLAB's function, as they can hold no object ----
+#     s = load('rig.mat');
+#     stereoParams = stereoParametersFromOpenCV(s.intrinsicMatrix1, s.distortionCoefficients1, s.intrinsicMatrix2, ...
+#         s.distortionCoefficients2, s.rotationOfCamera2, s.translationOfCamera2, s.imageSize, WorldUnits=s.worldUnits);
+# For the reverse, save the values of stereoParametersToOpenCV under these names. MATLAB's image size: (rows, columns).
+
+_MAT = [f"{what}{number}" for number in (1, 2) for what in ("intrinsicMatrix", "distortionCoefficients")]
+_MAT += ["rotationOfCamera2", "translationOfCamera2"]
+
+
+def write_stereo_parameters(path: Path, rig: StereoRig) -> None:
+    """Write arguments of stereoParametersFromOpenCV in metres, and the world frame. Raises OutputError."""
+    size = np.array(rig.left.image_size[::-1], float)[None]
+    save_mat(path, {"worldUnits": "m", "imageSize": size} | _numbers(rig, _MAT))
+
+
+def read_stereo_parameters(path: Path, *, unit: float | None = None, world_is_table: bool = False) -> StereoRig:
+    """A rig from a MAT file with these arguments.
+
+    unit : [m] of translationOfCamera2 if the file has no worldUnits
+    world_is_table : True if the world of R_left_world is the table, k up, whatever the file says
+    Raises RigFileError.
+    """
+    with told_as(RigFileError, f"{path}: not a MAT file of version 5", Exception, then="Save it with -v6 or -v7."):
+        found = scipy.io.loadmat(path)
+    if "intrinsicMatrix1" not in found:
+        names = ", ".join(name for name in found if not name.startswith("__"))
+        raise RigFileError(f"{path}: holds {names or 'nothing'}; save by name what stereoParametersToOpenCV returns")
+    stated = str(np.ravel(found.get("worldUnits", ""))[0]) if np.size(found.get("worldUnits", "")) else ""
+    scale = unit if unit is not None else {"m": 1.0, "mm": 1e-3}.get(stated)
+    if scale is None:
+        raise RigFileError(f"{path}: does not say in which unit translationOfCamera2 is; give it (0.001 for mm)")
+    size = array_of(found, "imageSize", (2,), str(path))[::-1]
+    return _stereo_rig(found, _MAT, (size, size), scale, world_is_table, str(path))
+
+
+def save_mat(path: Path, content: Mapping[str, Any]) -> None:
+    """Write variables by their names. Raises OutputError."""
+    buffer = io.BytesIO()
+    scipy.io.savemat(buffer, dict(content), oned_as="column", long_field_names=True)
+    write_whole(path, buffer.getbuffer())
+
+
+def _stereo_rig(
+    found: Mapping[str, Any],
+    names: Sequence[str],
+    sizes: Sequence[Array],
+    unit: float,
+    world_is_table: bool,
+    where: str,
+) -> StereoRig:
+    """A rig from arguments of OpenCV's functions; names : of K and D of both cameras, of R and t from left to right.
+
+    Also uses R_left_world, t_left_world and world_is_table if found. unit : [m]
+    Raises RigFileError.
+    """
+    *of_cameras, R, t = names
+    cameras = [
+        camera_of(array_of(found, K, (3, 3), where), array_of(found, D, (-1,), where), size, f"{where}: {K}, {D}")
+        for K, D, size in zip(of_cameras[::2], of_cameras[1::2], sizes, strict=True)
+    ]
+    world = {"R_left_world": np.eye(3), "t_left_world": np.zeros(3), "world_is_table": 0.0, **found}
+    places: dict[str, Any] = {}
+    for rotation, translation, between in ((R, t, "right_left"), ("R_left_world", "t_left_world", "left_world")):
+        places[f"R_{between}"] = rotation_of(array_of(world, rotation, (-1,), where), f"{where}: {rotation}")
+        places[f"t_{between}"] = unit * array_of(world, translation, (3,), where)
+    is_table = world_is_table or bool(np.ravel(world["world_is_table"])[0])
+    return StereoRig(cameras[0], cameras[1], **places, world_is_table=is_table)
+
+
+def _numbers(rig: StereoRig, names: Sequence[str]) -> dict[str, Any]:
+    """The inverse of `_stereo_rig`, in metres: values of `names`, and the world frame."""
+    of_cameras = [number for camera in rig.cameras for number in (camera.camera_matrix, np.array([camera.distortion]))]
+    numbers = dict(zip(names, (*of_cameras, rig.R_right_left, rig.t_right_left[:, None]), strict=True))
+    world = {"R_left_world": rig.R_left_world, "t_left_world": rig.t_left_world[:, None]}
+    return numbers | world | {"world_is_table": int(rig.world_is_table)}
 
 
 # --- Approximation of a lens field, or of coefficients that a format lacks, by Brown's coefficients that it stores ----

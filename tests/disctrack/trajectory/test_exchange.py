@@ -22,7 +22,7 @@ from disctrack.errors import OutputError, RigFileError
 from disctrack.frames import COORDINATES, rotation_from_euler
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
-from disctrack.trajectory.exchange import arrays, formats, motion, rigs
+from disctrack.trajectory.exchange import formats, motion, rigs
 from tests.disctrack.trajectory.test_file import make_trajectory
 
 
@@ -272,19 +272,19 @@ def test_what_a_file_does_not_tell_may_be_told(rig, tmp_path):
     text = (tmp_path / "rig.toml").read_text()
     (tmp_path / "rig.toml").write_text(third_camera(text, rig))
     assert rigs.read_caliscope(tmp_path / "rig.toml", cameras=("0", "1")).baseline == pytest.approx(rig.baseline)
-    arrays.write_opencv(tmp_path / "rig.yml", rig)
+    rigs.write_opencv(tmp_path / "rig.yml", rig)
     text = (tmp_path / "rig.yml").read_text()
     (tmp_path / "rig.yml").write_text(re.sub("unit: .*", 'unit: "foot"', text))
-    assert arrays.read_opencv([tmp_path / "rig.yml"], unit=0.5).baseline == pytest.approx(0.5 * rig.baseline)
+    assert rigs.read_opencv([tmp_path / "rig.yml"], unit=0.5).baseline == pytest.approx(0.5 * rig.baseline)
     for cut in range(0, len(text), 37):
         (tmp_path / "cut.yml").write_text(text[:cut])
         with contextlib.suppress(RigFileError):
-            arrays.read_opencv([tmp_path / "cut.yml"])
+            rigs.read_opencv([tmp_path / "cut.yml"])
 
 
 def test_matlab_struct_has_every_number_with_both_sigmas(trajectory, tmp_path):
     path = tmp_path / "t.mat"
-    arrays.write_mat(path, trajectory)
+    motion.write_mat(path, trajectory)
     found = loadmat(path, simplify_cells=True)["disctrack"]
     assert np.array_equal(found["q"], trajectory.q, equal_nan=True)
     assert np.array_equal(found["q_sigma"], trajectory.coordinate_sigma, equal_nan=True)

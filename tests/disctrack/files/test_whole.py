@@ -10,7 +10,7 @@ import pytest
 
 from disctrack import open_frames, read_recording
 from disctrack.errors import OutputError, RecordingError
-from disctrack.files.inputs import inputs_kept, keep, open_regular, read_regular, refuse_input
+from disctrack.files.whole import inputs_kept, keep, open_regular, read_regular, refuse_input
 from disctrack.recording.readers.raw import RawFile
 from tests.disctrack.recording.readers.written import write_sequence
 
