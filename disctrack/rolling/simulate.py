@@ -53,6 +53,7 @@ class Effort(NamedTuple):
     rtol: float = 1e-11  # without dissipation the energy is constant to 1e-11 over 1.5 s
     max_switches: int = 2000  # between slip and rolling; more is chatter: the motion ends, and has no derivatives
     max_steps: int = 1_000_000  # of the integrator, in all regimes and runs; after these derivatives are NaN
+    rtol_of_derivatives: float = 1e-11  # with which the motion is followed for these
 
 
 FULL = Effort()
@@ -315,7 +316,8 @@ def sensitivities(
             else:
                 moved = Assembly(enlarged, theta_end, complex, {name: enlarged.values[name] + 1j * _SEED})
                 scale = _scale(moved, path, grid)
-            run = follow(moved, y, grid, effort._replace(max_steps=effort.max_steps - n_steps), scale)
+            left = Effort(effort.rtol_of_derivatives, effort.max_switches, effort.max_steps - n_steps)
+            run = follow(moved, y, grid, left, scale)
             n_steps += run.n_steps
             found[: len(run.now), :, column] = _numbers(run).imag / _SEED
     q, qdot, _ = np.split(found[..., 0], [6, 12], axis=1)
