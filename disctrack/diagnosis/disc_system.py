@@ -359,7 +359,8 @@ class DiscSystem(System):
         # a motion that needs more steps is given up
         left = int(min(self.budget.trial_left, self.trial_work * (ROLLS if rolls else 1.0)))
         of_state = [n.partition(".")[2] for n in components]
-        effort = Effort(RTOL, limit, left)
+        # steps of a fit and scores need derivatives to 1e-6 only: to 1e-8 they take four fifths of the steps
+        effort = Effort(RTOL, limit, left, rtol_of_derivatives=10 * RTOL)
         moving = sensitivities(model, state, times, tuple(parameters.values()), of_state, motion.THETA_END, effort)
         self.budget.work(moving.n_steps)
         by_motion, moved = moving.dq.copy(), (*components, *parameters)

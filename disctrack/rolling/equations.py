@@ -59,7 +59,7 @@ ROLLING, SLIPPING, FLYING = map(int, Regime)
 EVENTS = ("theta_end", "load", "grip", "upright")
 STICK_SPEED = 1e-7  # [m/s]; 1e-4 of the resolution of the tracking, and 1e-8 of the disc's speeds
 LOAD_STEP = 1e-4  # [s]; errors: (200 rad/s times it)^2 / 12 = 3e-5 of F_z'', and rounding 1e-8 N/s^2
-CREEP_PASSES = 3  # orders of the expansion of creep, in c / (3 g) times the rate of the motion
+FAST_CREEP = 3e-4  # [m/s] of creep, from which on (c / g times rates of 100 rad/s)^2 is 1e-5 of v_A
 FILM = 2e-3  # [m/s] of creep: (c / g times rates of 100 rad/s)^3 is 1e-5 of v_A, and steps of 0.1 ms are stable
 NEAR_CONTACT = 1e-10  # [m] step at which Newton's method stops; the error is its square over the radius
 LIFT_OFF_GAP = 1e-12  # [m] below which the disc has landed; not zero, which is the gap at the start of a flight
@@ -352,30 +352,42 @@ def _load_and_friction(now: Record) -> Vector:
 
 
 @exact_part
-def _load_after(
+def _rates_after(
     h: float, rate: State, t: complex, y: State, forced: Forced, table: Addresses, body: Record, now: Record
-) -> Vector:
-    """`_load_and_friction` after h, by the midpoint method."""
-    for part in (0.5 * h, h):
-        a_x, a_y, j_x, j_y, slip_n, slip_m, share = forced
-        later = (a_x + part * j_x, a_y + part * j_y, j_x, j_y, slip_n, slip_m, share)
-        rate = _rigid_table_rates(t + part, _euler_step(y, part, rate), later, table, body, now)
-    return _load_and_friction(now)
+) -> State:
+    """Rates on a rigid table after an Euler step; also fills the record."""
+    a_x, a_y, j_x, j_y, slip_n, slip_m, share = forced
+    later = (a_x + h * j_x, a_y + h * j_y, j_x, j_y, slip_n, slip_m, share)
+    return _rigid_table_rates(t + h, _euler_step(y, h, rate), later, table, body, now)
 
 
 @exact_part
 def _load_derivatives(
-    t: complex, y: State, forced: Forced, table: Addresses, body: Record, now: Record
+    twice: bool, t: complex, y: State, forced: Forced, table: Addresses, body: Record, now: Record
 ) -> tuple[Vector, Vector, Vector]:
-    """`_load_and_friction` along the motion, and its first two time derivatives."""
+    """`_load_and_friction` along the motion and its time derivative; the second one, too, or zero if not `twice`."""
     h = LOAD_STEP
     rate = _rigid_table_rates(t, y, forced, table, body, now)
     at_once = _load_and_friction(now)
-    after = _load_after(h, rate, t, y, forced, table, body, now)
-    before = _load_after(-h, rate, t, y, forced, table, body, now)
+    rate_after = _rates_after(h, rate, t, y, forced, table, body, now)
+    after = _load_and_friction(now)
+    rate_before = _rates_after(-h, rate, t, y, forced, table, body, now)
+    before = _load_and_friction(now)
     first = _scale(0.5 / h, _add(after, _scale(-1.0, before)))
-    second = _scale(1.0 / (h * h), _add(_add(after, before), _scale(-2.0, at_once)))
-    return at_once, first, second
+    if not twice:
+        return at_once, first, _scale(0.0, first)
+    # the motion bends by h^2 / 2 times the rate of the rates away from either step
+    bent = _euler_step(_euler_step(y, 0.5 * h, rate_after), -0.5 * h, rate_before)
+    _rigid_table_rates(t, bent, forced, table, body, now)
+    sum_ = _add(_add(after, before), _load_and_friction(now))
+    return at_once, first, _scale(1.0 / (h * h), _add(sum_, _scale(-3.0, at_once)))
+
+
+@exact_part
+def _creeping(creep: complex, first: Vector, second: Vector) -> Forced:
+    """Acceleration of the contact and its rate, from derivatives of `_load_and_friction`."""
+    zero = 0.0 * creep
+    return -creep * first[1], -creep * first[2], -creep * second[1], -creep * second[2], zero, zero, zero
 
 
 @exact_part
@@ -396,11 +408,12 @@ def _table_motion(t: complex, y: State, table: Addresses, body: Record, now: Rec
         speed2, slow2 = now.slip_n * now.slip_n + now.slip_m * now.slip_m, slow * slow
         share = slow2 * slow2 / (slow2 * slow2 + speed2 * speed2)
         forced = (zero, zero, zero, zero, now.slip_n, now.slip_m, share)
-    force, first, second = _load_derivatives(t, y, forced, table, body, now)
-    for _ in range(CREEP_PASSES - 1 if creep != 0.0 else 0):
-        # the force that accelerates the creeping disc is part of the force that causes the creep
-        forced = (-creep * first[1], -creep * first[2], -creep * second[1], -creep * second[2], zero, zero, zero)
-        force, first, second = _load_derivatives(t, y, forced, table, body, now)
+    force, first, second = _load_derivatives(True, t, y, forced, table, body, now)
+    # the force that accelerates the creeping disc is part of the force that causes the creep
+    if creep.real > FAST_CREEP:
+        force, first, second = _load_derivatives(True, t, y, _creeping(creep, first, second), table, body, now)
+    if creep.real > 0.0:
+        force, first, _ = _load_derivatives(False, t, y, _creeping(creep, first, second), table, body, now)
     velocity = (-creep * force[1], -creep * force[2], -compliance * first[0])
     return -compliance * force[0], velocity, (-creep * first[1], -creep * first[2], -compliance * second[0])
 

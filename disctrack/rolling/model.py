@@ -12,7 +12,7 @@ import numpy as np
 from calibration.kit.arguments import Density, Gravity, checked
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import ModelError
-from disctrack.rolling.effects.base import Effect, EffectParameter, effect_class
+from disctrack.rolling.effects.base import CATALOGUE, Effect, EffectParameter, effect_class
 from disctrack.rolling.effects.learned import effect_from_formulas
 from disctrack.rolling.records import BODY, UNEVEN
 
@@ -73,8 +73,11 @@ class Model:
 
     def effect_class(self, name: str) -> type[Effect]:
         """Class of the effect of this name: in the model, among its laws, or in the catalogue; raises ModelError."""
+        return self._known(name) or effect_class(name)
+
+    def _known(self, name: str) -> type[Effect] | None:
         own = (*(type(effect) for effect in self.effects), *self.laws)
-        return next((e for e in own if e.name == name), None) or effect_class(name)
+        return next((e for e in own if e.name == name), CATALOGUE.get(name))
 
     def split_name(self, full_name: str) -> tuple[type[Effect], str]:
         """(effect, "parameter") of "effect.parameter"; raises ModelError if no effect has this parameter."""
@@ -87,11 +90,9 @@ class Model:
 
     def has_name(self, full_name: str) -> bool:
         """Is this the name of a parameter that the model has or accepts?"""
-        try:
-            self.split_name(full_name)
-        except ModelError:
-            return False
-        return True
+        name, _, parameter = full_name.partition(".")
+        effect = self._known(name)
+        return effect is not None and parameter in [p.name for p in effect.parameters]
 
 
 def body_constants(model: Model, theta_end: float, values: Mapping[str, Any] = {}) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from types import CodeType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_simpson
 
 from calibration.kit.arguments import FrameRate, Seconds, Times, checked
@@ -53,6 +53,7 @@ class Effort(NamedTuple):
     rtol: float = 1e-11  # without dissipation the energy is constant to 1e-11 over 1.5 s
     max_switches: int = 2000  # between slip and rolling; more is chatter: the motion ends, and has no derivatives
     max_steps: int = 1_000_000  # of the integrator, in all regimes and runs; after these derivatives are NaN
+    rtol_of_derivatives: float = 1e-11  # with which the motion is followed for these
 
 
 FULL = Effort()
@@ -141,23 +142,22 @@ class Assembly:
             self._laws.append((law, parameters))
             calls += [law.address, parameters.ctypes.data]
             in_air += calls[-2:] if effect.airborne else []
-        self._tables = [self._table(regime, in_air if regime == FLYING else calls) for regime in range(3)]
-
-    def _table(self, regime: int, calls: list[int]) -> NDArray[np.int64]:
-        return np.array([regime, len(calls) // 2, self.instant.ctypes.data, *calls], np.int64)
-
-    def system(self, regime: int) -> integrate.CompiledSystem:
-        """Rates and margins in this regime."""
-        a, b, c = (array.ctypes.data for array in (self._tables[regime], self.body, self.instant))
-        return integrate.CompiledSystem(self._rates.address, a, b, c, len(EVENTS))
+        b, c = self.body.ctypes.data, self.instant.ctypes.data
+        by_regime = (calls, calls, in_air)
+        self._tables = [np.array([i, len(part) // 2, c, *part], np.int64) for i, part in enumerate(by_regime)]
+        # rates and margins in each regime
+        self.systems = [
+            integrate.CompiledSystem(self._rates.address, table.ctypes.data, b, c, len(EVENTS))
+            for table in self._tables
+        ]
 
     def at(self, regime: int, t: ArrayLike, Y: Numbers) -> tuple[Numbers, Numbers, Records]:
         """Rates (N, n), margins (N, 4) and records.INSTANT (N,) at states Y (N, n), or at one (n,)."""
         t, Y = np.atleast_1d(t).astype(Y.dtype), np.ascontiguousarray(np.atleast_2d(Y))
         out: Numbers = np.zeros((len(Y), Y.shape[1] + len(EVENTS)), Y.dtype)
-        found = np.repeat(self.instant, len(Y))
+        found = np.empty(len(Y), self.instant.dtype)
         rows = found.view(Y.dtype).reshape(len(Y), -1)
-        integrate.evaluate(self.system(regime), t, Y, out, self.instant.view(Y.dtype), rows)
+        integrate.evaluate(self.systems[regime], t, Y, out, self.instant.view(Y.dtype), rows)
         return out[:, : Y.shape[1]], out[:, Y.shape[1] :], found
 
     def constant(self, name: str) -> Any:
@@ -187,7 +187,7 @@ def follow(assembly: Assembly, y: Numbers, grid: Array, effort: Effort = FULL, s
             regime, y = SLIPPING, np.concatenate([y, assembly.at(ROLLING, t, y)[0][0, :2]])
         event = _event_at_start(assembly, regime, t, y)
         if event < 0:
-            system, atol = assembly.system(regime), ATOL[: len(y)]
+            system, atol = assembly.systems[regime], ATOL[: len(y)]
             left = effort.max_steps - n_steps
             Y, t, y, event, n = integrate.integrate(system, t, y, grid[i:], effort.rtol, atol, scale, left)
             n_steps += n
@@ -315,7 +315,8 @@ def sensitivities(
             else:
                 moved = Assembly(enlarged, theta_end, complex, {name: enlarged.values[name] + 1j * _SEED})
                 scale = _scale(moved, path, grid)
-            run = follow(moved, y, grid, effort._replace(max_steps=effort.max_steps - n_steps), scale)
+            left = Effort(effort.rtol_of_derivatives, effort.max_switches, effort.max_steps - n_steps)
+            run = follow(moved, y, grid, left, scale)
             n_steps += run.n_steps
             found[: len(run.now), :, column] = _numbers(run).imag / _SEED
     q, qdot, _ = np.split(found[..., 0], [6, 12], axis=1)
