@@ -102,22 +102,22 @@ _step, _polynomial = dop853.method(_slope)
 
 
 @exact_part
-def _error(step, K, new, size, largest, tolerance, to_come):
+def _error(step, K, new, size, least, largest, tolerance, duration):
     """Largest error of a step over its tolerance, of the states and of each sensitivity; infinite if not finite.
 
-    to_come : [s] duration of the motion, 0 in its first step. A sensitivity that is zero until this step (an overflow)
+    duration : [s] of the motion. A sensitivity below the least size until this step (an overflow, a motion from rest)
         has no size yet, to which its error could be relative: its slope times this duration is used
     """
     n, worst = len(size), 0.0
     for c in range(len(new) // n):
         top = 0.0
         if c > 0:
-            top = largest[c - 1]
+            top = max(largest[c - 1], least[c - 1])
             for i in range(n):
                 scale = abs(new[n * c + i])
-                if to_come > 0.0 and largest[c - 1] == 0.0:
+                if largest[c - 1] <= least[c - 1]:
                     for s in range(13):
-                        scale = max(scale, to_come * abs(K[s, n * c + i]))
+                        scale = max(scale, duration * abs(K[s, n * c + i]))
                 top = max(top, scale / (size[i] + 1e-300))
         e5, e3 = 0.0, 0.0
         for i in range(n):
@@ -219,7 +219,7 @@ def _along_stages(W, z, x, out):
 
 
 @entry
-def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_steps, samples, out):
+def integrate(rhs, z, p, columns, span, n, knots, pieces, size, least, tolerance, max_steps, samples, out):
     """Fill out (m, len(z)) with the solution at samples (m,), which increase; returns the number of steps.
 
     Its negative where the integration fails.
@@ -228,6 +228,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
     columns : (k,) index in p of each quantity; -1 for an initial state
     span : (2,) first and last instant
     size : (n,) of the states, to which the tolerance is relative
+    least : (k,) sizes of the sensitivities, in those of the states, below which they are rounding errors
     """
     N, m = len(z), len(samples)
     u, u_rate, piece = np.zeros(len(pieces)), np.zeros(len(pieces)), np.zeros(1, np.int64)
@@ -242,7 +243,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
     for i in range(n):
         speed, most = max(speed, abs(K[0, i]) / size[i]), max(most, _RAN_AWAY * size[i])
     h = min(end - t, 0.01 / speed) if speed > 0 else 0.01 * (end - t)
-    filled, stiff, rejected, at_limit, calm, first = 0, False, False, 0, 0, True
+    filled, stiff, rejected, at_limit, calm = 0, False, False, 0, 0
     for taken in range(max_steps):
         remaining = end - t
         last = remaining <= h * (1.0 + 1e-9)
@@ -262,7 +263,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
             _step(rhs, drive, t, z, step, made)
             # a step that ends at a knot uses the piece before it
             _slope(t + step, new, K[12], rhs, drive)
-            worst, power = _error(step, K, new, size, largest, tolerance, 0.0 if first else end - span[0]), -0.125
+            worst, power = _error(step, K, new, size, least, largest, tolerance, end - span[0]), -0.125
         if not worst <= 1.0:
             h = step * max(0.2, 0.9 * worst**power) if np.isfinite(worst) else 0.1 * step
             rejected = True
@@ -291,7 +292,7 @@ def integrate(rhs, z, p, columns, span, n, knots, pieces, size, tolerance, max_s
                     inside = True
                 dop853.along(made.F, z, x, out[filled])
             filled += 1
-        t, first = arrival, False
+        t = arrival
         z[:] = new
         before, drive.piece[0] = drive.piece[0], piece_at(t, knots)
         grow = 5.0 if worst == 0.0 else min(5.0, max(0.2, 0.9 * worst**power))
@@ -336,7 +337,7 @@ def evaluate(function, times, states, p, knots, pieces, values, by_state, by_num
 def prepare() -> None:
     """Compile the functions called from Python for these types only, or load them from the cache."""
     whole = types.int64
-    integrate.compile((RHS_TYPE, _v, _v, whole[::1], _v, whole, _v, _cube, _v, _f, whole, _v, _m))
+    integrate.compile((RHS_TYPE, _v, _v, whole[::1], _v, whole, _v, _cube, _v, _v, _f, whole, _v, _m))
     evaluate.compile((RHS_TYPE, _v, _m, _v, _v, _cube, _m, _cube, _cube))
     for function in (integrate, evaluate):
         function.disable_compile()

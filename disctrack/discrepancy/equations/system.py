@@ -18,6 +18,7 @@ from disctrack.discrepancy.system import Budget, Candidate, Quantity, System, Va
 from disctrack.errors import AnalysisError
 
 TOLERANCE = 1e-10  # of a step, relative to the size of a state
+FAINTEST = 1e-9  # share of its size by which a quantity of its usual size moves the motion: less is a rounding error
 MAX_STEPS = 400_000  # limit of an integration ...
 HARDER = 10  # ... and over the steps of the motion before a fit's step: a motion so much harder is rejected
 MOST_WORK = 2e8  # of an answer: steps of the integrator times states and sensitivities, some 1 us each ...
@@ -69,6 +70,7 @@ class EquationSystem(System):
             name: replace(self.formulas.declared[name], value=value, shape=False)
             for name, value in self.guesses.items()
         }
+        self._typical = np.array([self.typical.get(name, 1.0) for name in self._defaults])
         self._per = {name: p.per for name, p in self._declared.items() if p.per}
         self.base = tuple(self._base())
         self.candidates = tuple(self._candidate(t) for t in self.formulas.terms if t.name not in self.promoted)
@@ -193,11 +195,12 @@ class EquationSystem(System):
         at = which_time.reshape(late.shape).T, np.arange(self._w)  # sensors with a lag show earlier instants
         span = s.time[0], max(float(times[-1]), s.time[0] + 1e-9)
         most = MAX_STEPS if names else min(MAX_STEPS, HARDER * self._steps.get(s.name, MAX_STEPS))
+        scale = np.where(fitted, np.maximum(np.abs(p), self._typical)[own], self.sizes[-1 - np.minimum(own, -1)])
         out = np.empty((len(times), z0.size))
         with np.errstate(all="ignore"):
             steps = kernel.integrate(
                 f.rhs, z0.ravel(), p, np.maximum(own, -1), np.array(span), n, *f.driven(s.knots, s.pieces, p),
-                self.sizes, TOLERANCE, most, times, out,
+                self.sizes, FAINTEST / scale, TOLERANCE, most, times, out,
             )  # fmt: skip
         self._steps |= {s.name: steps} if names and steps > 0 else {}
         self.budget.work(abs(steps) * z0.size)
