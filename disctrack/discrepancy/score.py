@@ -47,6 +47,8 @@ class Linearisation:
         values |= dict(zip(common.names, common.null.tolist(), strict=True))
         names = list(dict.fromkeys([*(q.name for q in self.fitted), *new]))
         residual, derivative = system.linearise(values, [*own.slots, *names])
+        self.usable = bool(np.isfinite(derivative).all())  # one derivative that cannot be computed spoils all others
+        residual, derivative = (np.nan_to_num(x, posinf=0.0, neginf=0.0) for x in (residual, derivative))
         right, matrix, _ = own.reduced(residual, derivative, values, common)
         # a column that a block's own quantities absorb completely is left with rounding errors
         before = np.linalg.norm(derivative[..., len(own.slots) :], axis=(0, 1))

@@ -478,9 +478,16 @@ class _Search:
         """First-order gain of each further effect."""
         if e.names not in self.scored:
             linear = Linearisation(self.system, e.fit, self.candidates)
+            if not linear.usable:
+                self.candidates = tuple(c for c in self.candidates if self._has_derivative(c, e.fit.values))
+                linear = Linearisation(self.system, e.fit, self.candidates)
             others = [c for c in self.candidates if c.name not in e.names]
             self.scored[e.names] = linear, score_all(linear, others)
         return self.scored[e.names]
+
+    def _has_derivative(self, candidate: Candidate, values: Values) -> bool:
+        null = {q.name: q.null for q in candidate.quantities}
+        return bool(np.isfinite(self.system.linearise(null | dict(values), candidate.names)[1]).all())
 
     def _best_supported(self) -> Explanation:
         """The shortest explanation that predicts the held-out data better than subsets of its effects do."""
@@ -638,7 +645,9 @@ class _Search:
     def _all_outcomes(self, scores: Sequence[Score], found: tuple[Found, ...]) -> tuple[Tried, ...]:
         scored = {s.candidate.name for s in scores}  # the others are effects of the explanation that was first
         others = [f for f in found if f.candidate.name not in scored]
-        return (*_chosen(others), *(self._outcome(s, found) for s in scores))
+        lost = [c for c in self.system.candidates if not c.sought and c not in self.candidates]
+        without = (Tried(c, 0.0, None, None, "the motion has no derivative by it where it is absent") for c in lost)
+        return (*_chosen(others), *(self._outcome(s, found) for s in scores), *without)
 
     def _outcome(self, score: Score, found: tuple[Found, ...]) -> Tried:
         c, limit, first_order = score.candidate, self.threshold(len(score.candidate.names)), score.gain / self.noise

@@ -360,7 +360,7 @@ class _Competition:
         # residuals without the law
         right = linear.cleared(linear.right + columns @ np.array([values[q.name] for q in own]))
         columns = linear.cleared(columns)
-        if not (np.isfinite(columns).all() and np.isfinite(right).all()):
+        if not linear.usable:
             return np.inf, own
         size, root, found = shooting.scales(system, values).get(own[0].name, 1.0), np.sqrt(self.noise), []
         basis = _basis(len(law.variables))
