@@ -11,11 +11,14 @@ from dataclasses import replace
 from itertools import chain, combinations, combinations_with_replacement
 
 import numpy as np
+import sympy
 
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Term
+from disctrack.discrepancy.equations.expressions import parsed
 
 _ANY, _POSITIVE = Parameter(0.0), Parameter(0.0, lower=0.0)
 _SHARE = Parameter(0.0, lower=0.0, upper=1.0)
+VELOCITIES = ("m/s", "cm/s", "mm/s", "km/h", "rad/s", "deg/s")  # units
 
 
 def _on(v: str, formula: str, name: str, title: str, source: str = "", **parameters: Parameter) -> Term:
@@ -99,6 +102,12 @@ def coupling(v: str, x: str, w: str, y: str, name: str = "") -> Term:
     """
     rates, title = {v: f"-own_a*(({x}) - ({y}))", w: f"own_b*(({x}) - ({y}))"}, f"linear coupling of {x} and {y}"
     return Term(name or f"coupling_{x}_{y}", rates, parameters={"a": _ANY, "b": _ANY}, title=title)
+
+
+def exchange(v: str, w: str, formula: str, name: str = "") -> Term:
+    """By a formula, what one equation loses and another gains: a reaction, an infection, prey that is eaten."""
+    rates, title = {v: f"-own_a*({formula})", w: f"own_b*({formula})"}, f"exchange of {v} and {w} by {formula}"
+    return Term(name or f"exchange_{v}_{w}", rates, parameters={"a": _ANY, "b": _ANY}, title=title)
 
 
 def asymmetric_spring(v: str, x: str, name: str = "") -> Term:
@@ -228,52 +237,71 @@ def saturation(v: str, u: str, gain: str, name: str = "") -> Term:
     return _on(v, formula, name or f"saturation_{u}", title, share=_SHARE, limit=limit)
 
 
-def input_delay(v: str, u: str, gain: str, name: str = "") -> Term:
-    """The measured input acts with a delay; `gain` is its factor in the equation of v."""
-    tau, late, rates = {"tau": Parameter(0.0, unit="s")}, {"late": (u, "own_tau")}, {v: f"({gain})*(own_late - {u})"}
+def input_delay(v: str, u: str, gain: str, name: str = "", onto: Mapping[str, str] | None = None) -> Term:
+    """The measured input acts with a delay; `gain` is its factor in the equation of v.   onto : in others, by state"""
+    rates = {w: f"({factor})*(own_late - {u})" for w, factor in {v: gain, **(onto or {})}.items()}
+    tau, late = {"tau": Parameter(0.0, unit="s")}, {"late": (u, "own_tau")}
     return Term(name or f"delay_{u}", rates, delayed=late, parameters=tau, title=f"input {u} acts late")
+
+
+def _gains(equations: Equations, u: str) -> dict[str, str]:
+    """By state, the factor of an input in its equation; without those in which it has none."""
+    e = equations
+    words = {n: sympy.Symbol(n, real=True) for n in ("t", *e.rates, *e.parameters, *e.constants, *e.inputs)}
+    words |= {f"{n}_rate": sympy.Symbol(f"{n}_rate", real=True) for n in e.inputs}
+    slopes = {y: parsed(f, words, f"equation of {y}").diff(words[u]) for y, f in e.rates.items()}
+    return {y: str(slope) for y, slope in slopes.items() if slope != 0 and words[u] not in slope.free_symbols}
 
 
 def usual(equations: Equations) -> tuple[Term, ...]:
     """Default terms, by the structure of the equations; and common errors of sensors.
 
-    A coordinate is a state whose declared rate is another state: rates={"x": "v", "v": ...}; that one is a velocity, on
-    which friction and springs act. Any other state is a level (of a tank, a charge, a temperature): it leaks, is fed,
-    runs over into the first of the states that it drives. Two or three in one unit may be a point's, or coupled.
+    A coordinate is a state whose declared rate is another state: rates={"x": "v", "v": ...}; that one is a velocity, as
+    is a state in the unit of one: friction and springs act on it. Any other state is a level (of a tank, a charge, a
+    temperature): it leaks, is fed, runs over into the first of the states that it drives. Two or three in one unit may
+    be a point's, or coupled.
     """
     found: list[Term] = []
     written = {y: str(f).strip() for y, f in equations.rates.items()}
     pairs = {x: v for x, v in written.items() if v in written}
+    velocities = {*pairs.values(), *(y for y in written if equations.units.get(y) in VELOCITIES)}
     for y in written:
         if y in pairs:
             continue
         found += [constant(y), viscous(y)]
-        if y in pairs.values():
+        if y in velocities:
             found += [coulomb(y), quadratic(y)]
             continue
         fed = next((z for z, f in written.items() if z not in (y, *pairs) and re.search(rf"\b{y}\b", f)), "")
         powers = asymmetric_spring(y, y, f"square_{y}"), cubic_spring(y, y, f"cube_{y}")
         found += [replace(p, title=f"loss of {y} by its {p.name.partition('_')[0]}") for p in powers]
         found.append(overflow(equations, y, fed))
+        found += [exchange(y, fed, f"{y}**2", f"square_{y}_into_{fed}")] if fed else []
     groups: dict[tuple[bool, str], list[str]] = {}  # coordinates, or levels, in the same unit
-    for x in (x for x in written if x not in pairs.values()):
+    for x in (x for x in written if x not in velocities):
         groups.setdefault((x in pairs, equations.units.get(x, "1")), []).append(x)
     for (move, _), several in groups.items():
         if not 1 < len(several) <= 3:  # a point has three coordinates, and of more levels the pairs are too many
             continue
         if move:
-            velocities = [pairs[x] for x in several]
-            found += [quadratic(velocities), coulomb(velocities)]
-            found += [across(v, w) for v, w in combinations(velocities, 2)]
+            own = [pairs[x] for x in several]
+            found += [quadratic(own), coulomb(own)]
+            found += [t for v, w in combinations(own, 2) for t in (across(v, w), coupling(v, v, w, w))]
+        else:
+            found += [exchange(x, y, f"{x}*{y}") for x, y in combinations(several, 2)]
         found += [coupling(pairs.get(x, x), x, pairs.get(y, y), y) for x, y in combinations(several, 2)]
     for x, v in pairs.items():
         found += [spring(v, x), asymmetric_spring(v, x), cubic_spring(v, x), deflected(v, x)]
         found += [end_stop(v, x), end_stop(v, x, -1)]
+    for u in equations.inputs:
+        if gains := _gains(equations, u):
+            (v, gain), *others = gains.items()
+            found.append(input_delay(v, u, gain, onto=dict(others)))
     observed = equations.observed if equations.observed is not None else {}
     for channel, formula in observed.items():
         found += [sensor_offset(channel), sensor_drift(channel), sensor_curvature(channel, str(formula))]
         # a share of a limit looks like drag in a fall
-        if str(formula).strip() in {*written} - {*pairs, *pairs.values()}:
+        if str(formula).strip() in {*written} - {*pairs, *velocities}:
             found.append(sensor_limit(channel, str(formula)))
         if equations.inputs or len(observed) > 1:
             found.append(sensor_lag(channel))

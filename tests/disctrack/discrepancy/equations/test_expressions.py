@@ -151,10 +151,12 @@ def test_what_is_usual_follows_from_the_structure():
     offered = {t.name: t for t in terms.usual(tanks)}
     assert set(offered["overflow_upper"].rates) == {"upper", "lower"}
     assert set(offered["overflow_lower"].rates) == {"lower"}
-    assert "limit_seen" in offered
+    assert {"limit_seen", "square_upper_into_lower", "exchange_upper_lower"} <= set(offered)
     assert not {"coulomb_upper", "quadratic_upper", "spring_upper"} & set(offered)
     of_motion = {t.name for t in terms.usual(Equations({"x": "v", "v": "-k*x"}, {"k": 1.0}))}
     assert {"coulomb_v", "quadratic_v", "spring_x"} <= of_motion
+    motor = Equations({"w": "(K*u - b*w)/J"}, {"K": 1.0, "b": 1.0, "J": 1.0}, inputs=["u"], units={"w": "rad/s"})
+    assert {"coulomb_w", "delay_u"} <= {t.name for t in terms.usual(motor)}
     assert not any(name.startswith("overflow") for name in of_motion)
     of_two = Equations({"x": "v", "v": "-k*x", "q": "w", "w": "-k*q"}, {"k": 1.0}, units={"x": "m", "q": "rad"})
     assert not {"coupling_x_q", "across_v_w", "quadratic_v_w"} & {t.name for t in terms.usual(of_two)}
