@@ -18,7 +18,7 @@ from disctrack.discrepancy.equations.formulas import Formulas
 from disctrack.discrepancy.equations.law import learn, with_law
 from disctrack.discrepancy.equations.system import MOST_STATES, EquationSystem, fitted_rows
 from disctrack.discrepancy.fit import Fit, fit, no_fit
-from disctrack.discrepancy.score import Linearisation
+from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import WIDTH, Diagnosis, Former, Settings, explain
 from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import USED_UP, Candidate, Values
@@ -101,7 +101,7 @@ def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationS
     promising: list[tuple[str, ...]] = [(c.name,) for c in whole.candidates]
     if start.followed:
         system, diagnosis = _searched(_with_sizes(start.system, start.values), start.values, settings)
-        promising = _promising(diagnosis, start.whole)
+        promising = _promising(whole, declared, diagnosis, start.whole)
         values = {}  # a fit of whole runs that stopped early begins anew
         if start.whole:
             left = shooting.misfits(whole, diagnosis.ranked[0].fit.values).max() if diagnosis.ranked else np.inf
@@ -110,7 +110,10 @@ def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationS
     # stretches may be too short to show what is missing, and a fit without it may stop early: fit some terms first
     if ways := _reached_by(whole, values, promising, left):
         names, values = next(iter(ways.items()))
-        system, diagnosis = _searched(_with_sizes(whole, values), values, settings, ways)
+        # without these terms their values may lead nowhere
+        starts = ({q.name: v[q.name] for q in whole.base if q.name in v} for v in (values, start.values))
+        begin = next((v for v in starts if np.isfinite(shooting.misfits(whole, v)).all()), declared)
+        system, diagnosis = _searched(_with_sizes(whole, values), begin, settings, ways)
         note = f"the fit was reached with {' and '.join(sorted(names))}: without it the model loses longer stretches"
         if {f.candidate.name for f in diagnosis.found} & frozenset().union(*ways):
             note = "with what was found the model follows the whole runs, and these were fitted"
@@ -125,15 +128,22 @@ def _first_answer(system: EquationSystem, settings: Settings) -> tuple[EquationS
     return system, diagnosis, [] if start.whole else [note, *further]
 
 
-def _promising(diagnosis: Diagnosis, whole: bool) -> list[tuple[str, ...]]:
+def _promising(system: EquationSystem, values: Values, diagnosis: Diagnosis, whole: bool) -> list[tuple[str, ...]]:
     """Terms with which a fit of whole runs may be reached; none where the answer is one of whole runs already.
 
-    For an arm that friction stops, no fit gets from a motion that never ends to the instant of the stop.
+    For an arm that friction stops, no fit gets from a motion that never ends to the instant of the stop. Where a model
+    is far from whole runs, first-order gains over these mean nothing: over the shortest stretches they are exact.
     """
     if diagnosis.found or (whole and diagnosis.verdict != "unexplained"):
         return [] if whole else [tuple(f.candidate.name for f in diagnosis.found)]
     tried = [t for t in diagnosis.tried if not whole or (t.stuck and t.gain is not None and t.gain > 0)]
-    return [(t.candidate.name,) for t in sorted(tried, key=lambda t: -t.score)[:WIDTH]]
+    named = [t.candidate.name for t in sorted(tried, key=lambda t: -t.score)[:WIDTH]]
+    if whole and system.budget.open():
+        first = shooting.fit_over_levels(shooting.levels(system)[:1], values)
+        short = _with_guesses(_with_sizes(first.system, first.values), first.values)
+        scores = score_all(Linearisation(short, no_fit(short.base, first.values), short.candidates), short.candidates)
+        named += [s.candidate.name for s in scores[:WIDTH]]
+    return [(name,) for name in dict.fromkeys(named)]
 
 
 def _searched(
@@ -188,10 +198,8 @@ def _with_guesses(system: EquationSystem, values: Mapping[str, float]) -> Equati
         bounds = [(f.declared[name].lower, f.declared[name].upper) for name in f.along]
         tried = dict(zip(f.along, np.clip(along, *np.transpose(bounds)).tolist(), strict=True))
         there = replace(system, guesses=tried)
-        if not np.isfinite(there.linearise(values, [n for c in amounts for n in c.names])[1]).all():
-            continue
         linear = Linearisation(there, here, amounts)
-        for c in amounts:
+        for c in amounts if linear.usable else ():
             gain, _ = linear.gain_of(c.names)
             if gain > best.get(c.name, (0.0, {}))[0]:
                 best[c.name] = gain, {n: v for n, v in tried.items() if f.owner[n] == c.name}
@@ -277,7 +285,7 @@ def unidentifiable(system: EquationSystem, values: Mapping[str, float]) -> tuple
     columns = linear.columns(everything.names) * [max(abs(values.get(q.name, q.null)), q.scale) for q in free]
     length = np.linalg.norm(columns, axis=0)
     shares = linear.cleared(columns) / np.where(length > 0, length, 1.0)
-    if not np.isfinite(shares).all():
+    if not linear.usable:
         return ()
     stems = np.array([q.stem for q in free])
     weak: list[str] = []

@@ -173,14 +173,14 @@ def misfits(system: EquationSystem, values: dict[str, float]) -> Array:
     return np.asarray(np.sqrt(square / np.maximum(size, 1e-300)), float)
 
 
-def levels(system: EquationSystem) -> list[EquationSystem]:
+def levels(system: EquationSystem, share: float = SHORT) -> list[EquationSystem]:
     """Levels of multiple shooting: runs in stretches of a share of a period, joined two by two until they are whole.
 
     At most MOST_STATES initial states are fitted: of the stretches that start where longer ones do.
     """
     most, long = MOST_STATES / len(system.formulas.states), longest_stretches(system)
     spacing = min(float(np.median(np.diff(s.time))) for s in long)
-    duration = max(SHORT * shortest_period(system), FEWEST * spacing)
+    duration = max(share * shortest_period(system), FEWEST * spacing)
     levels: list[list[Samples]] = []
     while not levels or len(levels[-1]) > len(system.stretches):
         levels.append([part for s in system.stretches for part in cut(s, duration)])
@@ -192,7 +192,9 @@ def levels(system: EquationSystem) -> list[EquationSystem]:
 
 def fitted_start(system: EquationSystem, values: Values) -> Start:
     """Fit short stretches, and longer and longer ones, until these are whole or the model no longer follows them."""
-    found = _fit_over_levels(levels(system), values)
+    found = fit_over_levels(levels(system), values)
+    if not found.followed:  # the slowest of several oscillations may be the strongest
+        found = fit_over_levels(levels(system, 0.0), values)
     followed = longest_duration(found.system) if found.followed else 0.0
     if found.whole or followed > shortest_period(system):
         return found
@@ -203,13 +205,14 @@ def fitted_start(system: EquationSystem, values: Values) -> Start:
     return Start(system, at_once, longest_duration(system), True) if follows else found
 
 
-def _fit_over_levels(systems: Sequence[EquationSystem], values: Values) -> Start:
+def fit_over_levels(systems: Sequence[EquationSystem], values: Values) -> Start:
+    """Fit each level from the one before, as far as the model follows the motion."""
     now = dict(values) | initial_guess(systems[0])[0]
     now |= fit(systems[0], [q for q in systems[0].base if q.is_initial], now, TRIAL).values
     reached: list[tuple[EquationSystem, dict[str, float]]] = []
     for part in systems:
         trial = now | fit(part, [with_weak_prior(q) for q in part.base], now, TRIAL).values
-        if not misfits(part, trial).max() <= LOST:
+        if not np.median(misfits(part, trial)) <= LOST:
             break
         now = trial  # a longer stretch has the initial state of its first part
         reached.append((part, now))

@@ -426,7 +426,7 @@ def test_an_input_held_for_an_hour_costs_a_step_a_sample(rng):
     most = int(1.1 * 3000)  # steps: 45 000 when the end of a step looked into the next piece
     assert kernel.integrate(
         system.formulas.rhs, np.array([0.3]), p, np.zeros(0, np.int64), samples.time[[0, -1]], 1,
-        samples.knots, samples.pieces, system.sizes, 1e-10, most, samples.time, out,
+        samples.knots, samples.pieces, system.sizes, np.zeros(0), 1e-10, most, samples.time, out,
     )  # fmt: skip
 
 
@@ -547,15 +547,16 @@ def fallen(g, c):
     return case((rates, {"c": 0.03}, {"g": g}), course, (time, dict.fromkeys("xyz", 1e-3)), (), {"c": c})
 
 
-def held(late):
+def held(late, **known):
     """A controller holds its output from sample to sample, 0.1 s; a third of one, or three and a half, is lost."""
     pushes, decay = np.repeat(np.random.default_rng(1).standard_normal(200), 3), np.exp(-0.01 / 0.8)
+    pushes[:6] = 0.0
     at = lambda t: pushes[np.clip(np.floor((t + 1e-9) / 0.1).astype(int), 0, 599)]  # noqa: E731
     x = lfilter([0.0, 1 - decay], [1.0, -decay], at(0.01 * np.arange(6000) - late))[::10]
     return case(
         ({"x": "(u - x)/tau"}, {"tau": 0.6}), {"x": x}, (0.1 * np.arange(600), {"x": 2e-3}),
         [terms.input_delay("x", "u", "1/tau"), terms.quadratic("x"), terms.constant("x")],
-        {"tau": 0.8} | ({"delay_u.tau": late} if late else {}), {"u": at}, hold="hold",
+        {"tau": 0.8} | ({"delay_u.tau": late} if late else {}), {"u": at}, hold="hold", known=known,
     )  # fmt: skip
 
 
@@ -631,6 +632,8 @@ CASES = {
     "an input that acts a third of a sample late": held(0.03),
     "an input that acts three and a half samples late": held(0.35),
     "an input that acts at once": held(0.0),
+    # what it has not moved yet has no derivative but rounding errors
+    "an input that acts late on what was at rest": held(0.35, x=0.0),
     "a ball that falls from rest": fallen(9.81, 0.02),
     # what acts against one component depends on the whole velocity
     "the drag of a thrown ball": resisted("0.05*sqrt(v**2 + w**2)", 9.81, {"quadratic_v_w.c": 0.05}),
@@ -653,6 +656,18 @@ CASES = {
         ({"x": "0.05*(y - x) - 0.1*x", "y": "0.1*(x - y) - 0.08*y"}, [80.0, 5.0]),
         (0.2 * np.arange(300), {"x": 0.05, "y": 0.05}), None, {"coupling_x_y.a": 0.05, "coupling_x_y.b": 0.1},
     ),
+    "a reaction of second order": case(
+        ({"A": "-k*A", "B": "k*A - l*B"}, {"k": 0.12, "l": 0.05}),
+        ({"A": "-0.1*A - 0.05*A**2", "B": "0.1*A + 0.05*A**2 - 0.05*B"}, [1.0, 0.0]),
+        (0.4 * np.arange(120), {"A": 3e-3, "B": 3e-3}), None, {"square_A_into_B.a": 0.05, "square_A_into_B.b": 0.05},
+        sigma=3e-3, known={"A": 1.0, "B": 0.0},
+    ),
+    # a linear model loses it at once, and first-order gains over the whole mean nothing
+    "a nerve that fires": case(
+        ({"V": "a*V - w + 0.5", "w": "e*(V + b - c*w)"}, {"a": 0.3, "e": 0.08, "b": 0.7, "c": 0.8}),
+        ({"V": "V - V**3/3 - w + 0.5", "w": "0.08*(V + 0.7 - 0.8*w)"}, [-1.0, 1.0]),
+        (0.1 * np.arange(1000), {"V": 0.01, "w": 0.01}), None, {"a": 1.0, "e": 0.08, "cube_V.k": 1 / 3}, sigma=0.01,
+    ),
     # of unequal mass: what the play takes from one is missing on the other, too
     "play between two parts": case(
         ({"x": "v", "y": "w", "v": "u - b*v - k*(x - y) - s*x", "w": "k*(x - y)/m - c*w"},
@@ -664,6 +679,26 @@ CASES = {
         sigma=5e-4, by={"max_step": 0.005},
     ),
 }  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_law_of_two_variables_is_learned_from_chaos(rng):
+    asked = case(
+        ({"x": "s*(y - x)", "y": "x*(r - z) - y", "z": "-b*z"}, {"s": 10.0, "r": 28.0, "b": 2.667}),
+        ({"x": "10*(y - x)", "y": "x*(28 - z) - y", "z": "x*y - 8*z/3"}, [1.0, 1.0, 20.0]),
+        (0.01 * np.arange(800), dict.fromkeys("xyz", 0.05)), None, {}, sigma=0.05,
+    )[0]  # fmt: skip
+    law = asked(rng).law
+    assert (law.along.equation, law.along.variables) == ("z", ("x", "y"))
+    assert np.mean(np.abs(law.force - law.variable.prod(axis=1)) < 3 * law.sigma) > 0.9
+
+
+def test_a_term_without_a_derivative_does_not_hide_the_others(rng):
+    x = motion(lambda t, y: [y[1], -40 * y[0] - 0.8 * y[1]], [1.0, 0.0], TIME)[0] + SIGMA * rng.standard_normal(870)
+    offered = [terms.viscous("v"), terms.force("v", "1/x", "endless")]
+    answer = diagnose(Equations({"x": "v", "v": "-k*x"}, {"k": 40.0}), Run(TIME, {"x": x}, SIGMA), offered)
+    assert_found(answer, ("viscous_v",), {"k": 40.0, "viscous_v.c": 0.8})
+    assert "no derivative" in answer.diagnosis.tried[-1].reason
 
 
 @pytest.mark.statistical
