@@ -17,7 +17,7 @@ from calibration.kit.least_squares import triangle
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.covariates import Hypothesis, hypotheses
 from disctrack.discrepancy.joint.crew import Crew
-from disctrack.discrepancy.joint.fitting_in import Blocks, ConsistencyTest, inconsistent
+from disctrack.discrepancy.joint.fitting_in import Blocks, ConsistencyTest, all_consistencies, inconsistent
 from disctrack.discrepancy.joint.sharing import EACH, JointSystem, Member, Sharing
 from disctrack.discrepancy.score import Linearisation, score_all, sigmas, span
 from disctrack.discrepancy.search import Diagnosis, Found, Settings, explain
@@ -121,8 +121,12 @@ def answer_together(
             reasons[kept[k]] = "does not fit the others" + (f"; it differs most by: {effect}" if effect else "")
     progress("each recording against the others")
     diagnosis, alone = _with_autocorrelation(system, diagnosis, crew)
-    blocks = Blocks(system, diagnosis.after)
-    judged = {kept[k]: (blocks.consistency(k, others), alone[k]) for k, others in blocks.others(range(len(kept)))}
+    blocks = Blocks(system, diagnosis.after, effects)
+    by_effect = all_consistencies(blocks, list(range(len(kept))))
+    judged = {
+        kept[k]: (replace(blocks.consistency(k, others), differs_by=by_effect[k].differs_by), alone[k])
+        for k, others in blocks.others(range(len(kept)))
+    }
     recordings = [
         OfRecording(name, dict(labels), reasons.get(i, ""), *judged.get(i, ()))
         for i, (name, labels) in enumerate(described)
@@ -229,10 +233,11 @@ def _notes(recordings: Sequence[OfRecording], unusable: Sequence[str]) -> tuple[
     how = dict.fromkeys(unusable, "was left out: ")
     notes = [f"{r.name} {how.get(r.name, '')}{r.reason}" for r in recordings if r.reason]
     for r in recordings:
-        if r.consistency is not None and r.consistency.p_value * len(recordings) < FALSE_ALARM:
+        if (test := r.consistency) is not None and test.p_value * len(recordings) < FALSE_ALARM:
+            by = f"it differs most by: {test.differs_by}; " if test.differs_by else ""
             notes.append(
-                f"{r.name} does not fit the others (p = {r.consistency.p_value:.1g}), and yet is among them: more than "
-                "a third would have to go, and the sizes are those of no recording"
+                f"{r.name} does not fit the others (p = {test.p_value:.1g}), and yet is among them: {by}more than a "
+                "third would have to go, and the sizes are those of no recording"
             )
         if r.alone is not None and r.alone.converged:
             ratio = r.alone.reduced_chi_square
