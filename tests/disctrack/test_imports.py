@@ -64,10 +64,7 @@ def rows_of_the_page() -> list[list[str]]:
 # Each folder or module of a package may ask for what stands above it, at whatever place in the file it does so. A new
 # one belongs where what it needs is above, and what needs it below; names in one row know nothing of each other.
 CALIBRATION = ("kit", "board cameras", "fit", "judge", "stereo", "rig_file")
-STAIRS = {
-    "calibration": [row.split() for row in CALIBRATION],
-    "disctrack": (*rows_of_the_page(), ("__main__",)),
-}
+STAIRS = {"calibration": [row.split() for row in CALIBRATION], "disctrack": (*rows_of_the_page(), ("__main__",))}
 SOURCES = {
     ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): file
     for package in PACKAGES

@@ -279,9 +279,7 @@ UNKNOWN: dict[str, Unknown] = {
     ),
     "thrust": Unknown(force(lambda d, n: 3e-3 * n.d)),
     "twisted_thread": Unknown(
-        moment(lambda d, n: -3e-6 * n.memory[0] * K),
-        rate_of_memory=lambda d, n, z: n.omega[2],
-        omega3=1.5,
+        moment(lambda d, n: -3e-6 * n.memory[0] * K), rate_of_memory=lambda d, n, z: n.omega[2], omega3=1.5
     ),
     "worn_in": Unknown(  # friction that falls with the distance rolled
         by_load(lambda d, n: -1.5e-4 * np.exp(-n.memory[0] / 0.4) * rolling(n)),
