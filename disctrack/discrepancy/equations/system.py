@@ -92,12 +92,10 @@ class EquationSystem(System):
 
     def _with_slots(self, name: str, quantities: Sequence[Quantity]) -> list[Quantity]:
         """With a slot for every quantity without bounds that belongs to a single stretch."""
-        stretches: dict[str, list[int]] = {}
-        for i, s in enumerate(self.stretches):
-            stretches.setdefault(self._name(name, s), []).append(i)
+        of_stretches = [self._name(name, s) for s in self.stretches]
         return [
-            replace(q, slot=f"{name}[{EACH}]", block=stretches[q.name][0])
-            if name in self._per and len(stretches[q.name]) == 1 and np.isinf([q.lower, q.upper]).all()
+            replace(q, slot=f"{name}[{EACH}]", block=of_stretches.index(q.name))
+            if name in self._per and of_stretches.count(q.name) == 1 and np.isinf([q.lower, q.upper]).all()
             else q
             for q in quantities
         ]
