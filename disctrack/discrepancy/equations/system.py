@@ -193,7 +193,9 @@ class EquationSystem(System):
         at = which_time.reshape(late.shape).T, np.arange(self._w)  # sensors with a lag show earlier instants
         span = s.time[0], max(float(times[-1]), s.time[0] + 1e-9)
         most = MAX_STEPS if names else min(MAX_STEPS, HARDER * self._steps.get(s.name, MAX_STEPS))
-        scale = np.where(fitted, np.maximum(np.abs(p), self._typical)[own], self.sizes[-1 - np.minimum(own, -1)])
+        scale = np.ones(k)
+        scale[initial] = self.sizes[-1 - own[initial]]
+        scale[fitted] = np.maximum(np.abs(p), self._typical)[own[fitted]]
         out = np.empty((len(times), z0.size))
         with np.errstate(all="ignore"):
             steps = kernel.integrate(
