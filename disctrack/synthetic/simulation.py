@@ -57,13 +57,13 @@ def run_simulate(
     """
     scene_path, output = Path(scene_path), Path(output)
     keep(scene_path)
+    refuse_existing(output, overwrite)
     scene = load_scene(scene_path)
     if scene.motion.kind != "rolling":
         raise SceneError(
             f'{scene_path}: motion.kind is "{scene.motion.kind}"; simulate needs kind = "rolling" and, if wanted, '
             "[motion.rolling] with its start and effects"
         )
-    refuse_existing(output, overwrite)
     rate = scene.cameras.frame_rate_hz if rate is None else rate
     duration = max(scene.cameras.n_frames - 1, 1) / scene.cameras.frame_rate_hz if duration is None else duration
     motion = simulate(rolling_model(scene), rolling_start(scene), duration, rate=rate)
