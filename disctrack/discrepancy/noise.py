@@ -230,8 +230,8 @@ def _log_likelihood(s: SampleStretch, Q: Array, noise: SmoothNoise) -> float:
 
 
 def outlier_limit(sizes: Array) -> float:
-    """Size above which a residual is an outlier, from the median of all sizes, to which outliers do not matter."""
-    return OUTLIER * float(np.nanmedian(sizes) / norm.ppf(0.75))
+    """Size above which a residual is an outlier, by the median of all sizes, which has none; NaN without sizes."""
+    return OUTLIER * float(np.nanmedian(sizes) / norm.ppf(0.75)) if np.isfinite(sizes).any() else np.nan
 
 
 _ORDERS = range(2, 7)  # of differences: higher ones suppress more of the motion

@@ -292,7 +292,9 @@ class Answer:
             loose = [n for n, v in self.values.items() if "." not in n and not self.sigmas[n] < abs(v)]
             open_ = f" {', '.join(loose)} cannot be determined: declare a value or bounds." if loose else ""
             return f"No answer: {d.reason}.{open_} Initial values nearer to the truth may help."
-        level = ", ".join(f"{e.rms:.3g} {self._of(c)} (noise {e.noise:.3g})" for c, e in self.after.items())
+        told = {c: f"{e.rms:.3g} {self._of(c)} (noise {e.noise:.3g})" for c, e in self.after.items()}
+        ends = {c: f"no motion of {c} to its end" for c, e in self.after.items() if np.isnan(e.rms)}
+        level = ", ".join({**told, **ends}.values())
         if d.verdict == "nothing missing":
             return f"Nothing is missing: the equations leave {level}."
         effects = "; and ".join(self._law_text(f.candidate) or effect_text(f, d) for f in d.found)
