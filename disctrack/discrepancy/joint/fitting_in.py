@@ -124,15 +124,16 @@ def _least(right: Array, matrix: Array) -> tuple[float, int]:
     return float(np.sum((right - scaled @ x) ** 2)), int(rank)
 
 
-def all_consistencies(blocks: Blocks, kept: list[int]) -> dict[int, ConsistencyTest]:
-    """Each recording of `kept` against the others, by shared quantities or by the most significant candidates.
+def all_consistencies(blocks: Blocks, kept: Sequence[int]) -> dict[int, tuple[ConsistencyTest, ConsistencyTest]]:
+    """Each recording of `kept` against the others: by shared quantities, and by the more significant of two tests.
 
-    Where the size of a candidate has intrinsic scatter over all recordings, as in every laboratory a little, its
-    chi-square is scaled by it. p is the smaller one of both tests, with the trials penalty of the candidates.
+    The other test is that of the most significant candidate. Where the size of a candidate has intrinsic scatter over
+    all recordings, as in every laboratory a little, its chi-square is scaled by it; its p has the trials penalty of the
+    candidates.
     """
-    found, falls = dict[int, ConsistencyTest](), dict[int, list[tuple[float, int]]]()
+    found, falls = dict[int, tuple[ConsistencyTest, ConsistencyTest]](), dict[int, list[tuple[float, int]]]()
     for i, others in blocks.others(kept):
-        found[i], falls[i] = blocks.consistency(i, others), blocks.differences(i, others)
+        found[i], falls[i] = (blocks.consistency(i, others),) * 2, blocks.differences(i, others)
     scatter = _scatter(blocks, falls)
     for i, fall in falls.items():
         significant = [
@@ -142,11 +143,12 @@ def all_consistencies(blocks: Blocks, kept: list[int]) -> dict[int, ConsistencyT
         ]
         if not significant:
             continue
-        (p, minus, degrees, k), own = min(significant), found[i]
-        words = _named_difference(blocks, [(-x, d, k) for _, x, d, k in significant], own.statistic)
-        if (p, minus) < (own.p_value, -own.statistic):
-            own = replace(own, statistic=-minus / scatter[k], degrees=degrees, p_value=min(p, 1.0))
-        found[i] = replace(own, differs_by=words)
+        (p, minus, degrees, k), shared = min(significant), found[i][0]
+        words = _named_difference(blocks, [(-x, d, k) for _, x, d, k in significant], shared.statistic)
+        judged = shared = replace(shared, differs_by=words)
+        if (p, minus) < (shared.p_value, -shared.statistic):
+            judged = replace(shared, statistic=-minus / scatter[k], degrees=degrees, p_value=min(p, 1.0))
+        found[i] = shared, judged
     return found
 
 
@@ -184,24 +186,20 @@ def _scatter(blocks: Blocks, falls: dict[int, list[tuple[float, int]]]) -> list[
     return found
 
 
-def inconsistent(
-    system: JointSystem, fit: Fit, level: float, most: int | None = None, candidates: Sequence[Candidate] = ()
-) -> dict[int, str]:
+def inconsistent(blocks: Blocks, level: float, most: int | None = None) -> dict[int, str]:
     """Recordings that are inconsistent with the others, the worst first, and the effect by which they differ, if known.
 
     level : false-alarm probability over all recordings
     most : largest number of recordings that may be removed; by default a third
-    candidates : effects whose sizes may differ
     Each is tested against the remaining ones, to first order about a fit that the first one has biased: much smaller
     statistics have to be tested after another fit. Of two recordings, each of which is consistent without the other
     (as where only these two have the same disc), either may be wrong: both are named.
     """
-    n = len(system.time)
-    blocks = Blocks(system, fit, candidates)
+    n = len(blocks.chi_square)
     kept, named, first = list(range(n)), dict[int, str](), 0.0
     most = n // 3 if most is None else most
     while len(kept) > 2 and len(named) < most:
-        judged = all_consistencies(blocks, kept)
+        judged = {i: worse for i, (_, worse) in all_consistencies(blocks, kept).items()}
         worst, second, *_ = sorted(
             kept, key=lambda i: (judged[i].p_value, -judged[i].statistic / max(judged[i].degrees, 1))
         )
@@ -218,5 +216,5 @@ def inconsistent(
 
 def _interchangeable(blocks: Blocks, pair: tuple[int, int], kept: Sequence[int], level: float, small: float) -> bool:
     """Is each of the two consistent with `kept` without the other?   small : a statistic below it is not significant"""
-    without = (all_consistencies(blocks, [k for k in kept if k != other])[i] for i, other in (pair, pair[::-1]))
+    without = (all_consistencies(blocks, [k for k in kept if k != other])[i][1] for i, other in (pair, pair[::-1]))
     return not any(judged.p_value <= level and judged.statistic >= small for judged in without)

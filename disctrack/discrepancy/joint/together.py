@@ -114,19 +114,15 @@ def answer_together(
         diagnosis = _searched(system, settings)
         most = len(kept) - (2 * n + 2) // 3
         effects = [c for c in system.candidates if not c.name.endswith(f"({EACH})")]
-        out = inconsistent(system, diagnosis.after, settings.false_alarm, most, effects)
+        blocks = Blocks(system, diagnosis.after, effects)
+        out = inconsistent(blocks, settings.false_alarm, most)
         if not out:
             break
         for k, effect in out.items():
             reasons[kept[k]] = "does not fit the others" + (f"; it differs most by: {effect}" if effect else "")
     progress("each recording against the others")
     diagnosis, alone = _with_autocorrelation(system, diagnosis, crew)
-    blocks = Blocks(system, diagnosis.after, effects)
-    by_effect = all_consistencies(blocks, list(range(len(kept))))
-    judged = {
-        kept[k]: (replace(blocks.consistency(k, others), differs_by=by_effect[k].differs_by), alone[k])
-        for k, others in blocks.others(range(len(kept)))
-    }
+    judged = {kept[k]: (own, alone[k]) for k, (own, _) in all_consistencies(blocks, range(len(kept))).items()}
     recordings = [
         OfRecording(name, dict(labels), reasons.get(i, ""), *judged.get(i, ()))
         for i, (name, labels) in enumerate(described)

@@ -63,7 +63,7 @@ def test_nothing_is_found_where_nothing_is_hidden(rng):
 
 def strangers(items):
     system, found = answer(items)
-    return sorted(inconsistent(system, found.after, 0.005))
+    return sorted(inconsistent(Blocks(system, found.after), 0.005))
 
 
 def test_a_run_of_another_disc_among_them_is_named(rng):
@@ -79,10 +79,10 @@ def test_of_two_with_a_disc_of_their_own_that_disagree_both_are_named(rng):
     assert strangers(runs(rng, 9, run_5=heavy, **two)) == [7]
 
 
-def named(items, **more):
+def named(items, candidates=()):
     system, _ = joint(items)
     found = fit(system, system.base, system.sharing.start())
-    return inconsistent(system, found, 0.005, **more), system.candidates
+    return inconsistent(Blocks(system, found, candidates), 0.005), system.candidates
 
 
 def test_a_run_with_a_fault_that_no_shared_number_takes_is_named_with_the_fault(rng):
@@ -109,7 +109,7 @@ def test_differences_in_an_effect_and_to_the_others_are_chi_squares_and_name_nob
         for each in blocks.others(range(8)):
             falls.append(blocks.differences(*each))
             judged.append(blocks.consistency(*each))
-        false += bool(inconsistent(system, found, 0.005, candidates=system.candidates))
+        false += bool(inconsistent(blocks, 0.005))
     falls = np.array(falls)  # (320, candidates, 2)
     assert_allclose(falls[..., 1], np.tile([1, 2, 1], (320, 1)))
     # eight of seven are free; three standard errors
