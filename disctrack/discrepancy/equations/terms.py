@@ -11,10 +11,9 @@ from dataclasses import replace
 from itertools import chain, combinations, combinations_with_replacement
 
 import numpy as np
-import sympy
 
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Term
-from disctrack.discrepancy.equations.expressions import parsed
+from disctrack.discrepancy.equations.formulas import Formulas
 
 _ANY, _POSITIVE = Parameter(0.0), Parameter(0.0, lower=0.0)
 _SHARE = Parameter(0.0, lower=0.0, upper=1.0)
@@ -100,8 +99,8 @@ def coupling(v: str, x: str, w: str, y: str, name: str = "") -> Term:
 
     What it gives to one and takes from the other differs if their masses or capacities do.
     """
-    rates, title = {v: f"-own_a*(({x}) - ({y}))", w: f"own_b*(({x}) - ({y}))"}, f"linear coupling of {x} and {y}"
-    return Term(name or f"coupling_{x}_{y}", rates, parameters={"a": _ANY, "b": _ANY}, title=title)
+    linear = exchange(v, w, f"({x}) - ({y})", name or f"coupling_{x}_{y}")
+    return replace(linear, title=f"linear coupling of {x} and {y}")
 
 
 def exchange(v: str, w: str, formula: str, name: str = "") -> Term:
@@ -244,15 +243,6 @@ def input_delay(v: str, u: str, gain: str, name: str = "", onto: Mapping[str, st
     return Term(name or f"delay_{u}", rates, delayed=late, parameters=tau, title=f"input {u} acts late")
 
 
-def _gains(equations: Equations, u: str) -> dict[str, str]:
-    """By state, the factor of an input in its equation; without those in which it has none."""
-    e = equations
-    words = {n: sympy.Symbol(n, real=True) for n in ("t", *e.rates, *e.parameters, *e.constants, *e.inputs)}
-    words |= {f"{n}_rate": sympy.Symbol(f"{n}_rate", real=True) for n in e.inputs}
-    slopes = {y: parsed(f, words, f"equation of {y}").diff(words[u]) for y, f in e.rates.items()}
-    return {y: str(slope) for y, slope in slopes.items() if slope != 0 and words[u] not in slope.free_symbols}
-
-
 def usual(equations: Equations) -> tuple[Term, ...]:
     """Default terms, by the structure of the equations; and common errors of sensors.
 
@@ -293,10 +283,13 @@ def usual(equations: Equations) -> tuple[Term, ...]:
     for x, v in pairs.items():
         found += [spring(v, x), asymmetric_spring(v, x), cubic_spring(v, x), deflected(v, x)]
         found += [end_stop(v, x), end_stop(v, x, -1)]
-    for u in equations.inputs:
-        if gains := _gains(equations, u):
+    declared = Formulas(equations, (), {})
+    for u in declared.inputs:
+        slopes = {v: force.diff(u) for v, force in zip(written, declared.forces, strict=True)}
+        gains = {v: str(slope) for v, slope in slopes.items() if slope != 0 and u not in slope.free_symbols}
+        if gains:
             (v, gain), *others = gains.items()
-            found.append(input_delay(v, u, gain, onto=dict(others)))
+            found.append(input_delay(v, u.name, gain, onto=dict(others)))
     observed = equations.observed if equations.observed is not None else {}
     for channel, formula in observed.items():
         found += [sensor_offset(channel), sensor_drift(channel), sensor_curvature(channel, str(formula))]
