@@ -192,9 +192,12 @@ def levels(system: EquationSystem, share: float = SHORT) -> list[EquationSystem]
 
 def fitted_start(system: EquationSystem, values: Values) -> Start:
     """Fit short stretches, and longer and longer ones, until these are whole or the model no longer follows them."""
-    found = fit_over_levels(levels(system), values)
+    usual = levels(system)
+    found = fit_over_levels(usual, values)
     if not found.followed:  # the slowest of several oscillations may be the strongest
-        found = fit_over_levels(levels(system, 0.0), values)
+        finest = levels(system, 0.0)
+        if longest_duration(finest[0]) < longest_duration(usual[0]):
+            found = fit_over_levels(finest, values)
     followed = longest_duration(found.system) if found.followed else 0.0
     if found.whole or followed > shortest_period(system):
         return found
