@@ -292,9 +292,7 @@ class Answer:
             loose = [n for n, v in self.values.items() if "." not in n and not self.sigmas[n] < abs(v)]
             open_ = f" {', '.join(loose)} cannot be determined: declare a value or bounds." if loose else ""
             return f"No answer: {d.reason}.{open_} Initial values nearer to the truth may help."
-        told = {c: f"{e.rms:.3g} {self._of(c)} (noise {e.noise:.3g})" for c, e in self.after.items()}
-        ends = {c: f"no motion of {c} to its end" for c, e in self.after.items() if np.isnan(e.rms)}
-        level = ", ".join({**told, **ends}.values())
+        level = ", ".join(map(self._left, self.after))
         if d.verdict == "nothing missing":
             return f"Nothing is missing: the equations leave {level}."
         effects = "; and ".join(self._law_text(f.candidate) or effect_text(f, d) for f in d.found)
@@ -303,6 +301,13 @@ class Answer:
         where = f" {self.holds.text(self.equations.units)}" if self.holds else ""
         nearest = f"; the nearest is {effects}, which leaves" if effects else ": the equations leave"
         return f"Something is missing that no term describes{nearest} {level}.{where}"
+
+    def _left(self, channel: str) -> str:
+        """Size of the residuals; a motion that cannot be integrated to its end has none."""
+        e = self.after[channel]
+        if np.isnan(e.rms):
+            return f"no motion of {channel} to its end"
+        return f"{e.rms:.3g} {self._of(channel)} (noise {e.noise:.3g})"
 
     def _of(self, channel: str) -> str:
         unit = self.equations.units.get(channel, "1")
