@@ -4,8 +4,6 @@ Each stage creates a `Finding` with a sentence; later stages read kinds, severit
 `leading` removes findings that another one explains.
 """
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Iterable, Mapping
@@ -78,7 +76,7 @@ class Kind(Enum):
     OTHER = "other"  # also a kind from a file of another version
 
     @classmethod
-    def _missing_(cls, value: object) -> Kind:
+    def _missing_(cls, value: object) -> "Kind":
         """OTHER for a kind that this version does not know."""
         return cls.OTHER
 

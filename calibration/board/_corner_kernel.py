@@ -15,8 +15,6 @@ gradient of 0.1 grey values per px shifts the corner by 0.004 px; it is known fr
 Compiled with numba: one view takes some 10^6 evaluations of this model, 0.05 s.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -9,8 +9,6 @@ corners is estimated from the view: the image of a flat grid is a smooth functio
 the corners about it is their error.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2
@@ -49,7 +47,7 @@ class CornerView:
     reasons: tuple[str, ...]  # (n,) why a corner was rejected; "" if it is accepted or out of view
     notes: tuple[str, ...] = ()
 
-    def reordered(self, order: Indices) -> CornerView:
+    def reordered(self, order: Indices) -> "CornerView":
         """The same view with corner order[i] at index i, for boards whose colouring allows several orders."""
         arrays = {name: getattr(self, name)[order] for name in ("points", "covariance", "accepted")}
         return replace(self, reasons=tuple(self.reasons[i] for i in order), **arrays)

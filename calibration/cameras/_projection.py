@@ -1,7 +1,5 @@
 """Compiled projection of one point, for the loops of both packages."""
 
-from __future__ import annotations
-
 from calibration.cameras._brown import distorted
 from calibration.kit.compiled import part
 

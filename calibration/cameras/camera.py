@@ -4,8 +4,6 @@ Pixel (0, 0) is the centre of the top-left pixel; a camera's axes are x right, y
 Brown's with OpenCV's coefficients in OpenCV's order.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
@@ -60,7 +58,7 @@ class Camera:
         return np.array([self.fx, self.fy, self.cx, self.cy, *self.distortion])
 
     @classmethod
-    def from_parameters(cls, parameters: Array, image_size: tuple[int, int]) -> Camera:
+    def from_parameters(cls, parameters: Array, image_size: tuple[int, int]) -> "Camera":
         """Inverse of `parameters`."""
         fx, fy, cx, cy, k1, k2, p1, p2, k3 = map(float, parameters)
         return cls(fx, fy, cx, cy, (k1, k2, p1, p2, k3), image_size)
@@ -223,7 +221,7 @@ class StereoRig(Brief):
             d_world.append(d_point @ self.R_left_world)
         return np.stack(pixels, axis=-3), np.stack(d_world, axis=-4), d_rig
 
-    def perturbed(self, delta: Array) -> StereoRig:
+    def perturbed(self, delta: Array) -> "StereoRig":
         """The rig after a small change delta (30,) of RIG_PARAMETERS (SI units, rotation vectors in radians)."""
         delta = np.asarray(delta, float)
         owned = zip(self.cameras, OF_CAMERAS, strict=True)

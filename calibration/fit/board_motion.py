@@ -10,8 +10,6 @@ motion. With gamma - 2, sigma^2 is its posterior mean instead of its mode, as fe
 pairs follow Lange, Little and Taylor (1989, J. Am. Stat. Assoc. 84, 881).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

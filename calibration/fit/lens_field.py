@@ -7,8 +7,6 @@ grid, and of a smaller one that varies within a cell. The sizes of both maximise
 covers. The field is kept if it reduces the held-out error.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

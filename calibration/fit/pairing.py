@@ -7,8 +7,6 @@ board: poorly determined directions (a shift along the axis) have little weight.
 long tails: the log likelihood of a pair is minus the logarithm of its squared distance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -47,14 +45,14 @@ class BoardPoses:
     middle: Array  # (n, 3) [m] of the board
     covariance: Array  # (n, 6, 6) of rotation and shift of the middle, for 1 px of noise, times the number of points
 
-    def __getitem__(self, index: AnyArray) -> BoardPoses:
+    def __getitem__(self, index: AnyArray) -> "BoardPoses":
         return BoardPoses(self.views[index], self.R[index], self.middle[index], self.covariance[index])
 
-    def of(self, views: AnyArray) -> BoardPoses:
+    def of(self, views: AnyArray) -> "BoardPoses":
         """Those of images with these numbers."""
         return self[np.searchsorted(self.views, views)]
 
-    def turned(self, turn: Array, mirror: bool = False) -> BoardPoses:
+    def turned(self, turn: Array, mirror: bool = False) -> "BoardPoses":
         """With the board rotated (3, 3) about its middle, and, if `mirror`, the camera's x reversed."""
         F = np.diag([-1.0 if mirror else 1.0, 1.0, 1.0])
         B = _both(-F if mirror else F, F)  # a rotation is an axial vector

@@ -8,8 +8,6 @@ Blocks of the least-squares problem are the views. The parameters of one view al
 12 if its two images have separate poses.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -62,7 +60,7 @@ class Problem:
         o = self.observations
         return 2 * o.view + o.camera * self.apart[o.view]
 
-    def seeing(self, observations: Observations, extra: float) -> Problem:
+    def seeing(self, observations: Observations, extra: float) -> "Problem":
         """The same with other observations, and `extra` [px^2] added to their covariances in both axes."""
         return replace(self, observations=observations, weights=inverse_covariance(observations.covariance, extra))
 

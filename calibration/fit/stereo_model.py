@@ -1,7 +1,5 @@
 """Model of the images of a flat target in two cameras: parameters, observations, derivatives."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -36,7 +34,7 @@ class Observations:
     def __len__(self) -> int:
         return len(self.view)
 
-    def __getitem__(self, keep: AnyArray) -> Observations:
+    def __getitem__(self, keep: AnyArray) -> "Observations":
         return Observations(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 

@@ -1,7 +1,5 @@
 """Compiled solution of small symmetric systems, for the loops of both packages."""
 
-from __future__ import annotations
-
 import math
 
 from calibration.kit.compiled import part

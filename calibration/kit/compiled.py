@@ -5,8 +5,6 @@ renderer's raster, the fit of poses, helpers of the effects' laws), so the cache
 files with compiled functions.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 from collections.abc import Callable, Iterator

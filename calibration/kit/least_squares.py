@@ -12,8 +12,6 @@ Residuals are observed minus predicted, in standard deviations; derivatives are 
 are applied by the caller: rows times the square root of the weight, and the loss itself as the cost.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar

@@ -4,8 +4,6 @@ Their matrices are small: synchronising threads costs more processor time than t
 busy machine.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 

@@ -16,8 +16,6 @@ it, and the left camera is on the right.
 A finding names the declared numbers that could be wrong, most likely first, the observation and the expectation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -75,7 +73,7 @@ class Boards(NamedTuple):
 def contradictions(
     trajectory: Trajectory,
     disc: Disc | None = None,
-    recording: Recording | None = None,
+    recording: "Recording | None" = None,
     noticed: Sequence[Finding] = (),
     boards: Boards | None = None,
     blur_px: Sequence[float] = (),

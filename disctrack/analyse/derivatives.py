@@ -6,8 +6,6 @@ R_k and regular at every angle; at frame i its first two derivatives are the ang
 acceleration in world axes. Euler rates follow from the angular velocity, not from differences of Euler angles.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -59,7 +57,7 @@ class MotionState(Brief):
         e1, e2, _ = frames.nodal_axes_world(psi, np.arctan2(s, c))
         return e1, e2, e3
 
-    def displaced(self, step: Array) -> MotionState:
+    def displaced(self, step: Array) -> "MotionState":
         """The state after a small change (18,) in the order of STATE."""
         shift, turn, *changes = step.reshape(6, 3)
         rates = (self.velocity, self.omega_world, self.acceleration, self.alpha_world)

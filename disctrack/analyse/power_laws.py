@@ -6,8 +6,6 @@ modelled by harmonics of a phase proportional to the precession angle. Otherwise
 on its phase at both ends of the window.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -192,12 +190,12 @@ class _Fit:
         """Weighted (2 n,)."""
         return np.asarray(self.linear(self.data)[1] / self.scale).ravel()
 
-    def refined(self) -> _Fit:
+    def refined(self) -> "_Fit":
         """The fit with optimal t_f and ratio, and weights from its residuals."""
         end = self.time[-1]
         to_collapse = max(self.t_f - end, 1e-4)
 
-        def at(x: Array) -> _Fit:
+        def at(x: Array) -> "_Fit":
             return replace(self, t_f=float(end + to_collapse * np.exp(x[0])), ratio=float(x[1]))
 
         bounds = [-4.0, RATIO_RANGE[0]], [4.0, RATIO_RANGE[1]]

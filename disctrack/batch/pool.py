@@ -3,8 +3,6 @@
 Each process does one job at a time: if it crashes or is killed, only that job is lost.
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import logging
@@ -35,7 +33,7 @@ LOOK = 0.1  # [s] between checks for Ctrl-C
 _CLEARING = 2.0  # [s] that processes have to clean up before the next request to end
 
 
-def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Row]]:
+def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: "Processes | Cluster") -> Iterator[tuple[Job, Row]]:
     """Do every job; yields each recording with its final row. Raises ClusterError.
 
     Rigs come first; a recording whose rig failed fails for the same reason. A job that another batch is working on is
@@ -49,7 +47,7 @@ def do_all(rigs: Sequence[Job], recordings: Sequence[Job], pool: Processes | Clu
     yield from _finished([job for job in recordings if job.rig not in no_rig], pool)
 
 
-def _finished(jobs: Sequence[Job], pool: Processes | Cluster) -> Iterator[tuple[Job, Row]]:
+def _finished(jobs: Sequence[Job], pool: "Processes | Cluster") -> Iterator[tuple[Job, Row]]:
     """Do the jobs in parallel; yields each with its final row when it ends."""
     running, died, again = {pool.submit(job): job for job in jobs}, list[Job](), list[Job]()
     while running:

@@ -1,7 +1,5 @@
 """The rolling disc as a system for the search: dots in both images, predicted by the rolling model and the rig."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence, Set
 from copy import copy
 from dataclasses import replace
@@ -174,7 +172,7 @@ class DiscSystem(System):
         times = np.stack([self.time, self.time + delay])
         return course(times), course(times, 1)
 
-    def about_poses(self, known: Values) -> DiscSystem:
+    def about_poses(self, known: Values) -> "DiscSystem":
         """The same dots about the measured poses, which replace the model of the motion.
 
         known : faults with which the poses were fitted
@@ -188,7 +186,7 @@ class DiscSystem(System):
         """Initial guess of the base quantities from the measured poses, with the known faults."""
         return start_values(self)
 
-    def again(self, candidates: tuple[Candidate, ...] | None = None, **other: Any) -> DiscSystem:
+    def again(self, candidates: tuple[Candidate, ...] | None = None, **other: Any) -> "DiscSystem":
         """A system of the same recording and model, with the same budget; rows, fields and known faults as here.
 
         Candidates and `slips` are the defaults if not given.
@@ -198,7 +196,7 @@ class DiscSystem(System):
         system.budget, system.notes = self.budget, self.notes
         return system
 
-    def beginnings(self) -> Iterator[DiscSystem]:
+    def beginnings(self) -> "Iterator[DiscSystem]":
         """First parts of increasing length, for fits that do not converge for the whole recording."""
         for stretch in STRETCHES:
             n = int(np.searchsorted(self.time, self.time[0] + stretch, side="right"))
@@ -219,7 +217,7 @@ class DiscSystem(System):
         """Of the frames [Hz]."""
         return float(1.0 / np.median(np.diff(self.time)))
 
-    def knowing(self, law: LearnedLaw) -> DiscSystem:
+    def knowing(self, law: LearnedLaw) -> "DiscSystem":
         """The same system with this law in its model: its coefficients may be among the values."""
         known = copy(self)
         known.model = self.model.knowing(law.effect)

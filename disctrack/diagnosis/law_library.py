@@ -5,8 +5,6 @@ records.KINEMATICS, and has a coefficient. Numbers in braces are shape parameter
 frequency): a grid of them is searched, and the best is the initial guess of a fit of shape and coefficients.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, product
@@ -60,7 +58,7 @@ class LearnedLaw:
     shapes: tuple[tuple[str, ...], ...] = ()  # ... and of its shape parameters
     values: Values = field(default_factory=dict)  # of all quantities of its fit
     alike: tuple[str, ...] = ()  # indistinguishable laws of similar length
-    others: tuple[tuple[LearnedLaw, float], ...] = ()  # all laws that fit as well, with their odds
+    others: "tuple[tuple[LearnedLaw, float], ...]" = ()  # all laws that fit as well, with their odds
     looked: float = 0.0  # chi-square that each family pays for multiple comparisons
 
     @property

@@ -6,8 +6,6 @@ an Occam factor for its parameters, and for multiple comparisons by the size of 
 known effects that remain significant is an explanation; the answer is the shortest one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 

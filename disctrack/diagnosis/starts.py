@@ -5,8 +5,6 @@ local minima. So the amplitudes of the effect are fitted to first order at many 
 the spectrum of the position residuals, and refits begin where chi-square decreases most.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -36,7 +34,7 @@ REFITS = 2  # initial guesses that are returned
 SLOW = 3.0  # periods of a vibration in the recording at least
 
 
-def first_motion(system: DiscSystem) -> MeasuredMotion:
+def first_motion(system: "DiscSystem") -> MeasuredMotion:
     """The first poses and their derivatives, at the instants corrected for the known faults. Raises AnalysisError."""
     n = int(np.flatnonzero(system.trajectory.measured[system.rows])[:SEGMENT][-1]) + 1
     first = part(system.trajectory, slice(system.rows.start, system.rows.start + n))
@@ -58,7 +56,7 @@ def first_contact(motion: MeasuredMotion) -> tuple[float, float]:
     return float(slip), float(np.clip(np.nan_to_num(at_first[COLUMN["friction_needed"]], nan=np.inf), *FRICTIONS))
 
 
-def start_values(system: DiscSystem) -> dict[str, float]:
+def start_values(system: "DiscSystem") -> dict[str, float]:
     """State and declared effects from which the fit of the whole recording converges; the known faults are held."""
     names, motion = {quantity.name for quantity in system.base}, first_motion(system)
     values = system.known | {k: v for k, v in first_state(motion).items() if k in names}
@@ -74,7 +72,7 @@ def start_values(system: DiscSystem) -> dict[str, float]:
     return values
 
 
-def shape_guesses(system: DiscSystem, candidate: Candidate, values: Values, least: float) -> list[tuple[float, ...]]:
+def shape_guesses(system: "DiscSystem", candidate: Candidate, values: Values, least: float) -> list[tuple[float, ...]]:
     """Initial guesses of the candidate's shape, the best first; empty if it needs none.
 
     least : gain to first order, below which a guess is not returned
@@ -98,7 +96,7 @@ def shape_guesses(system: DiscSystem, candidate: Candidate, values: Values, leas
     return [(float(places[i]), *(q.null for q in rest)) for i in best if gains[i] > least]
 
 
-def _frequencies(system: DiscSystem, values: Values) -> Array:
+def _frequencies(system: "DiscSystem", values: Values) -> Array:
     """Peaks [Hz] in the spectrum of the whitened position residuals, and frequencies half a bin from them."""
     difference, sigma = (x[:, :3] for x in system.coordinate_errors(values))
     residual = np.nan_to_num(difference / sigma)

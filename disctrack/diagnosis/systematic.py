@@ -7,8 +7,6 @@ deviations and the correlation length of these random fields are estimated by re
 components that no pose absorbs. The same fields, with these priors, are then fitted along with the motion as nuisances.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -209,7 +207,7 @@ def _with_faults(likelihood: Likelihood, sizes: Sizes, faults: Mapping[str, floa
         best, sizes = trials[name], sizes | {name: faults[name]}
 
 
-def find_systematic(system: DiscSystem) -> Systematic:
+def find_systematic(system: "DiscSystem") -> Systematic:
     """Sizes of the systematic errors of the dots, with the faults of the measurement that explain them better.
 
     The poses were found with the faults that the system knows.

@@ -5,8 +5,6 @@ There may be hundreds of them; they are projected out once (variable projection)
 (a run's initial state) are eliminated block by block, so that the cost grows linearly with the number of blocks.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
@@ -18,7 +16,7 @@ from calibration.kit.arrays import Array, Indices
 from calibration.kit.least_squares import OwnNumbers, eliminate, triangle
 from disctrack.discrepancy.system import Quantity, System, Values
 
-_KNOWN: WeakKeyDictionary[System, dict[tuple[object, ...], Projection]] = WeakKeyDictionary()
+_KNOWN: "WeakKeyDictionary[System, dict[tuple[object, ...], Projection]]" = WeakKeyDictionary()
 
 
 def prior_rows(quantities: Sequence[Quantity], values: Values) -> tuple[Array, Array]:

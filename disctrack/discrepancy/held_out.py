@@ -1,7 +1,5 @@
 """Prediction of held-out data: fit to the first part, predict the rest; it penalises flexible models."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -33,7 +31,7 @@ class HeldOut:
         """Rms prediction error over its expectation by noise and uncertainty of the fit (the noise floor)."""
         return float(np.sqrt(self.chi_square / self.expected)) if self.expected > 0 else float("nan")
 
-    def gain_over(self, before: HeldOut, noise: float) -> float:
+    def gain_over(self, before: "HeldOut", noise: float) -> float:
         """Gain of twice the log density over another prediction of the same samples, in units of the noise."""
         gain = 2 * (self.log_density - before.log_density) / noise
         return -np.inf if np.isnan(gain) else float(gain)  # NaN where neither has a prediction

@@ -7,8 +7,6 @@ the variance of an estimate is the long-run variance of its influence function (
 of Andrews 1991 for Bartlett's weights); or the data are whitened, by an autoregression or by a smooth covariance.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -238,7 +236,7 @@ _ORDERS = range(2, 7)  # of differences: higher ones suppress more of the motion
 MAX_MEMORY = 24  # largest order of an autoregression
 
 
-def with_noise(samples: Sequence[Samples]) -> list[Samples]:
+def with_noise(samples: "Sequence[Samples]") -> "list[Samples]":
     """Runs with sigmas: where none is given, estimated from differences of the channel's data in all runs."""
     estimated = np.full(samples[0].data.shape[1], np.nan)
     for c in range(len(estimated)):

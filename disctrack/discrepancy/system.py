@@ -4,8 +4,6 @@ The engine (fit, score, held_out, search) depends on this interface alone; adapt
 (`disctrack.diagnosis`, `examples`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -156,16 +154,16 @@ class System:
         """(n, w, b) orthonormal directions in which the residuals of a row may have common errors; all by default."""
         return np.tile(np.eye(width), (len(self.weights), 1, 1))
 
-    def beginnings(self) -> Iterable[System]:
+    def beginnings(self) -> "Iterable[System]":
         """The system restricted to longer and longer first parts of the data."""
         return ()
 
     @property
-    def known_as(self) -> tuple[System, bytes]:
+    def known_as(self) -> "tuple[System, bytes]":
         """Key of cached results: the underlying system, and which of its rows these are."""
         return self, b""
 
-    def over(self, system: System) -> System:
+    def over(self, system: "System") -> "System":
         """Another system with the transformation of this one applied to its rows."""
         return system
 

@@ -1,7 +1,5 @@
 """A recording on disk: a folder with `recording.toml`, read into frozen dataclasses in SI units, written, compared."""
 
-from __future__ import annotations
-
 import difflib
 import json
 import math
@@ -38,7 +36,7 @@ class Key(NamedTuple):
         """True if the key has no default."""
         return bool(self.example)
 
-    def like(self, example: str, remark: str) -> Key:
+    def like(self, example: str, remark: str) -> "Key":
         """The same key with an example and a remark."""
         return self._replace(example=example, remark=remark)
 

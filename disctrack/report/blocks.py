@@ -3,8 +3,6 @@
 A paragraph is a string, a list of sentences a list of strings; other blocks are instances of the classes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -50,7 +48,7 @@ class Drawn:
     name: str  # of the file
     title: str
     caption: str
-    figure: Figure
+    figure: "Figure"
 
     def encoded(self, kind: str) -> bytes:
         """The figure as a file of this kind ("png", "pdf", "svg")."""

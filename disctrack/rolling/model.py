@@ -1,7 +1,5 @@
 """A model of the motion: the declared disc and gravity, and the effects that are added to them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
@@ -55,11 +53,11 @@ class Model:
         """The effect of this name, or None."""
         return next((e for e in self.effects if e.name == name), None)
 
-    def with_effects(self, *effects: Effect) -> Model:
+    def with_effects(self, *effects: Effect) -> "Model":
         """Copy with these effects appended, or in place of those of the same name."""
         return replace(self, effects=tuple({e.name: e for e in (*self.effects, *effects)}.values()))
 
-    def with_values(self, values: Mapping[str, float]) -> Model:
+    def with_values(self, values: Mapping[str, float]) -> "Model":
         """Copy with new values by "effect.parameter"; effects not in the model are added, other parameters at null."""
         new = {e.name: dict(e.values) for e in self.effects}
         for full_name, value in values.items():
@@ -67,7 +65,7 @@ class Model:
             new.setdefault(effect.name, dict(effect.absent().values))[parameter] = value
         return replace(self, effects=tuple(self.effect_class(name)(**v) for name, v in new.items()))
 
-    def knowing(self, *laws: type[Effect]) -> Model:
+    def knowing(self, *laws: type[Effect]) -> "Model":
         """Copy that also accepts parameters of these laws, which replace laws of the same name."""
         return replace(self, laws=tuple({law.name: law for law in (*self.laws, *laws)}.values()))
 

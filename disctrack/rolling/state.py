@@ -1,7 +1,5 @@
 """Initial states of a simulation: arbitrary, regular precession, a disc hit by a ball."""
 
-from __future__ import annotations
-
 from dataclasses import astuple, dataclass, replace
 
 import numpy as np
@@ -47,7 +45,7 @@ class State:
         """Precession rate [rad/s]."""
         return float(self.omega2 / np.sin(self.theta))
 
-    def moved(self, **changes: float) -> State:
+    def moved(self, **changes: float) -> "State":
         """Copy with some components replaced."""
         return replace(self, **changes)
 

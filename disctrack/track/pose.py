@@ -4,8 +4,6 @@ The unknowns are a translation and a rotation vector in world axes, applied from
 singular; psi, theta, phi are computed from the result (`frames.euler_from_rotation`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -64,12 +62,12 @@ class DotsInFrames:
         """(n,) True where there is a pose."""
         return np.asarray(np.isfinite(self.t).all(axis=1))
 
-    def at(self, rows: Indices | slice) -> DotsInFrames:
+    def at(self, rows: Indices | slice) -> "DotsInFrames":
         """Some of the frames."""
         parts = {name: getattr(self, name)[rows] for name in ("pixels", "covariance", "R", "t")}
         return replace(self, **parts)
 
-    def delayed(self, rows: Indices) -> DotsInFrames:
+    def delayed(self, rows: Indices) -> "DotsInFrames":
         """Some of the frames, with a further parameter: frame periods by which the right camera is ahead.
 
         rows : frames with both neighbours
@@ -78,7 +76,7 @@ class DotsInFrames:
         by_delay[:, 0] = 0.0
         return replace(self.at(rows), further=by_delay[..., None])
 
-    def shifted(self, shift: Array) -> DotsInFrames:
+    def shifted(self, shift: Array) -> "DotsInFrames":
         """Rig and positions of the dots after the shift, and pixels without the effect of the further parameters."""
         places = slice(N_RIG, N_RIG + 2 * self.disc.n_markers)
         moved = np.column_stack([shift[places].reshape(-1, 2), np.zeros(self.disc.n_markers)])
@@ -86,7 +84,7 @@ class DotsInFrames:
         disc = replace(self.disc, marker_centres_body=self.disc.marker_centres_body + moved)
         return replace(self, rig=self.rig.perturbed(shift[:N_RIG]), disc=disc, pixels=pixels)
 
-    def fitted(self, reject: bool, shift: Array | None = None) -> tuple[DotsInFrames, PoseFits]:
+    def fitted(self, reject: bool, shift: Array | None = None) -> "tuple[DotsInFrames, PoseFits]":
         """The frames with poses fitted, after the shift if there is one; if a fit fails, the pose is kept."""
         moved = self if shift is None else self.shifted(shift)
         fits = fit_poses(moved, reject_outliers=reject, with_sensitivity=False)

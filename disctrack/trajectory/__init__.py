@@ -1,7 +1,5 @@
 """The measured motion of one recording, with uncertainties and the status of every frame."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -41,7 +39,7 @@ class FrameStatus(IntEnum):
     CONTRADICTED = 9, "refused: the dots contradict each other beyond their noise (glare, a hand, an exchanged image)"
     JUMPED = 10, "refused: no motion leads from the frames before or after to this pose (exchanged frames?)"
 
-    def __new__(cls, value: int, sentence: str = "") -> FrameStatus:
+    def __new__(cls, value: int, sentence: str = "") -> "FrameStatus":
         """A number with its sentence."""
         member = int.__new__(cls, value)
         member._value_, member.sentence = value, sentence
@@ -130,7 +128,7 @@ class Trajectory(Brief):
             }
         return shown | {"disc": f"{2e3 * self.disc.radius:g} mm, {self.disc.n_markers} dots"}
 
-    def to_xarray(self) -> xarray.Dataset:
+    def to_xarray(self) -> "xarray.Dataset":
         """The trajectory as `xarray.Dataset` with time, units and both sigmas; the disc's sizes are attributes."""
         from disctrack.trajectory.file import to_xarray
 

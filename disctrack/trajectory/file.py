@@ -4,8 +4,6 @@ Layout (axes in brackets): at the root time, frame, x y z psi theta phi with the
 reprojection_rms_px, status; groups `markers`, `disc`, `calibration`, and those that later stages add (`write_groups`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
@@ -271,7 +269,7 @@ def labelled(trajectory: Trajectory) -> dict[str, Variable]:
     return _root_variables(trajectory) | dots
 
 
-def to_xarray(trajectory: Trajectory) -> xarray.Dataset:
+def to_xarray(trajectory: Trajectory) -> "xarray.Dataset":
     """`xarray.Dataset` of the variables of the file's root and of its dots (`marker_...`).
 
     Raises OutputError if xarray is not installed.

@@ -4,8 +4,6 @@ A case is a named scene, with its faults, imperfections and light in all images.
 the recording are those of any user's recording. A comparison uses only the truth and the reported numbers.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

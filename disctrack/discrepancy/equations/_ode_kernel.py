@@ -7,8 +7,6 @@ solved by Newton's method with the exact derivative of all of them, the sensitiv
 computed: Hairer & Wanner, Solving Ordinary Differential Equations II, section IV.8, as SciPy's Radau has it.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import NamedTuple
 

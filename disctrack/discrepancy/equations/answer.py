@@ -1,7 +1,5 @@
 """The result of a diagnosis of equations: in words, in numbers, as JSON and as a page."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Declarations of the user: equations of motion, candidate terms, and runs of an experiment."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -102,7 +100,7 @@ class Equations:
         """Names of the states, in the order of their equations."""
         return tuple(self.rates)
 
-    def channels(self, run: Run) -> Mapping[str, Formula]:
+    def channels(self, run: "Run") -> Mapping[str, Formula]:
         """What is observed, by channel."""
         states = {name: name for name in run.data if name in self.rates}
         return states if self.observed is None else self.observed
@@ -145,7 +143,7 @@ class Run:
     at_rest: bool = False
     input_time: ArrayLike | None = None
 
-    def thinned(self, every: int) -> Run:
+    def thinned(self, every: int) -> "Run":
         """One sample in `every`, with the inputs averaged over a quarter of the time between two of these.
 
         Without averaging, the input would be aliased.
@@ -196,7 +194,7 @@ class Samples:
         """Run, and the number of its first sample if that is not 1; whatever its length."""
         return self.run if self.stretch == 0 else f"{self.run}#{self.stretch + 1}"
 
-    def part(self, first: int, last: int) -> Samples:
+    def part(self, first: int, last: int) -> "Samples":
         """Samples first <= i < last as a stretch with an initial state of its own."""
         rows = slice(first, last)
         own = first == 0

@@ -5,8 +5,6 @@ last part of a run are refitted, each as long as what is left is noise. What hap
 the states that the equations do not give.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The page of an answer: its report with figures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,14 +20,14 @@ _MOST_POINTS = 6000  # of a curve: more are not visible on a page
 _MOST_STRETCHES = 6
 
 
-def write_answer(answer: Answer, path: Path) -> list[Path]:
+def write_answer(answer: "Answer", path: Path) -> list[Path]:
     """Write the page; returns the figures that were written beside it. Raises OutputError."""
     drawn = [_drawn(answer, c, name) for c, name in enumerate(answer.system.formulas.channels)]
     law = [] if answer.law is None else [_law(answer, answer.law)]
     return write_page(path, answer.report((*law, *drawn)), ("png",))
 
 
-def _law(answer: Answer, law: LearnedForce) -> Drawn:
+def _law(answer: "Answer", law: LearnedForce) -> Drawn:
     """The learned law with its confidence band."""
     along, added = law.along, f"added to d{law.along.equation}/dt"
     named = ("time",) if along.of_time else along.variables
@@ -46,7 +44,7 @@ def _law(answer: Answer, law: LearnedForce) -> Drawn:
     return Drawn("law", "law", f"{law.along.title}, learned from the residuals{held}.", picture)
 
 
-def _drawn(answer: Answer, channel: int, name: str) -> Drawn:
+def _drawn(answer: "Answer", channel: int, name: str) -> Drawn:
     """Data and model, and the residuals in time and frequency, of the first stretches."""
     unit = answer.equations.units.get(name, "")
     picture, (top, middle, bottom) = panels(9, 7, 3)

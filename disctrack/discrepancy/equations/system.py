@@ -1,7 +1,5 @@
 """Equations and runs as a system that `discrepancy.search` can diagnose."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise

@@ -4,8 +4,6 @@ Each recording stays in one process, and recordings are independent: answers do 
 These end when the crew is closed, and with the process that started them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -45,7 +43,7 @@ class Crew:
             self.close()
             raise AnalysisError(ENDED_EARLY) from error
 
-    def __enter__(self) -> Crew:
+    def __enter__(self) -> "Crew":
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -5,8 +5,6 @@ same copy and page faults, and a truncated file or a lost network connection wou
 error.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import threading
@@ -74,7 +72,7 @@ class RawFile:
         self.read_into(buffer, offset, where)
         return buffer.tobytes()
 
-    def check_announced(self, camera: str, layout: PixelLayout, n: int, present: int) -> None:
+    def check_announced(self, camera: str, layout: "PixelLayout", n: int, present: int) -> None:
         """Raise RecordingError unless n > 0 and `present`, the number of frames in the file, is most of n."""
         if n < 1:
             raise RecordingError(f"{self} ({camera} camera): its header states no frame. Export it again.")

@@ -16,8 +16,6 @@ M_n thetadot - M_m phidot sin(theta) + M_z omega_z + X . v_O. The power of a pas
 psidot if psidot phidot < 0, as during the descent): its amounts have the lower bound 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -26,7 +24,7 @@ import numpy as np
 
 from disctrack.errors import ModelError
 
-CATALOGUE: dict[str, type[Effect]] = {}
+CATALOGUE: "dict[str, type[Effect]]" = {}
 SLOWEST_ROLLING = 1e-3  # [rad/s] rolling rate below which its direction is smoothed; discs roll faster than 1 rad/s
 
 
@@ -97,7 +95,7 @@ class Effect:
                 )
 
     @classmethod
-    def absent(cls) -> Effect:
+    def absent(cls) -> "Effect":
         """The effect with its amounts at null: the motion does not change, but has sensitivities to the parameters."""
         return cls(**{p.name: p.nominal if p.is_shape else p.null for p in cls.parameters})
 

@@ -5,8 +5,6 @@ disc at the start, extrapolates its motion while it is hidden, searches at growi
 backwards from where it was found again, and measures blur and noise.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -42,13 +40,13 @@ class Heading(NamedTuple):
     t: Array  # (3, 3) [m]
 
     @classmethod
-    def steady(cls, last: Pose, before: Pose) -> Heading:
+    def steady(cls, last: Pose, before: Pose) -> "Heading":
         """Heading of constant velocity: the turn and shift between these poses are repeated."""
         turn = last[0] @ before[0].T
         R, t = np.stack([turn.T @ before[0], before[0], last[0]]), [2 * before[1] - last[1], before[1], last[1]]
         return cls(R, np.stack(t))
 
-    def carried_on(self, steps: int) -> Heading:
+    def carried_on(self, steps: int) -> "Heading":
         """Heading after so many more frames with constant velocity."""
         (R_before, R_last), (t_before, t_last) = self.R[1:], self.t[1:]
         turn = rotation_from_vector(steps * vector_from_rotation(R_last @ R_before.T))

@@ -18,8 +18,6 @@ that of the pattern follows from its regularity, as a pattern with little stretc
 scale of the rig is corrected by its share.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,7 +54,7 @@ class AsBuilt:
     size_share: float = 0.0  # fraction of the excess by which the rig was enlarged
 
     @classmethod
-    def moved(cls, rig: StereoRig, disc: Disc, shift: Array, covariance: Array, reduced_chi_square: float) -> AsBuilt:
+    def moved(cls, rig: StereoRig, disc: Disc, shift: Array, covariance: Array, reduced_chi_square: float) -> "AsBuilt":
         """Dots displaced by the significant part of `shift` (m, 2), of covariance (2m, 2m)."""
         motions = _pattern_motions(disc).reshape(-1, 3)
         keep = np.eye(len(covariance)) - motions @ np.linalg.pinv(motions)
