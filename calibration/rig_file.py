@@ -21,9 +21,8 @@ import numpy as np
 from calibration.board.target import described, target_of
 from calibration.cameras.camera import CAMERA_NAMES, INTRINSIC_PARAMETERS, RIG_PARAMETERS, Allowance, Camera, StereoRig
 from calibration.cameras.splines import LensField
-from calibration.kit.arguments import checked
-from calibration.kit.arrays import AnyArray
 from calibration.kit.errors import RigFileError
+from calibration.kit.types import AnyArray, checked
 from calibration.stereo import StereoCalibration
 
 SCHEMA = "disctrack stereo rig"

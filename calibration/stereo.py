@@ -20,12 +20,11 @@ from calibration.fit.stereo_model import Observations
 from calibration.judge.assessment import Assessment, assess, stereo_covariance
 from calibration.judge.pairs import PairMotion, camera_moved, compared, judge_pairs, motion_between_exposures, zoomed
 from calibration.judge.tolerances import BoardTolerances, board_shape, rig_with_covariance, with_tolerances
-from calibration.kit.arguments import Thickness, checked
-from calibration.kit.arrays import AnyArray, Array
 from calibration.kit.brief import Brief
 from calibration.kit.errors import CalibrationError, told_as
 from calibration.kit.stuck_pixels import repaired_views
 from calibration.kit.threads import one_blas_thread
+from calibration.kit.types import AnyArray, Array, Thickness, checked
 
 LARGEST_SQUARE = 0.5  # m: above, the value was given in millimetres
 UNDETERMINED = "the views do not determine all parameters: add views with the board tilted in several directions"

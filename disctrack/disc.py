@@ -12,9 +12,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.kit.arguments import Length, Mass, checked
-from calibration.kit.arrays import Array, Mask
 from calibration.kit.brief import Brief
+from calibration.kit.types import Array, Length, Mask, Mass, checked
 from disctrack.errors import ModelError
 
 AIR_DENSITY = 1.2  # [kg/m^3] default, at 1013.25 hPa and 20 degC

@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from calibration.cameras.camera import converted_rotation
 from calibration.cameras.camera import rotation_from_vector as rotation_from_vector
 from calibration.cameras.camera import vector_from_rotation as vector_from_rotation
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 
 POSE_COMPONENTS = ("x", "y", "z", "rotation_x", "rotation_y", "rotation_z")
 COORDINATES = ("x", "y", "z", "psi", "theta", "phi")

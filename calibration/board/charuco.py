@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from calibration.board.chessboard import BoardNotFound, Located, as_8_bit, luminance, reduced
 from calibration.board.corner_fit import fit_view, smooth_grid
 from calibration.board.target import LEAST_POINTS, CharucoBoard
-from calibration.kit.arrays import AnyArray, Array, Indices
 from calibration.kit.errors import CalibrationError
+from calibration.kit.types import AnyArray, Array, Indices
 
 
 def find_charuco(image: AnyArray, board: CharucoBoard) -> Located:

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from calibration.board.corner_fit import CornerView, fit_view, grey_at, local_axes, squares_round
 from calibration.board.target import Board, board_orders
-from calibration.kit.arguments import checked
-from calibration.kit.arrays import AnyArray, Array
 from calibration.kit.errors import ArgumentError
 from calibration.kit.grey_levels import level_step
+from calibration.kit.types import AnyArray, Array, checked
 
 MARGIN = 1.15  # squares from the outermost corners: just outside the printed squares
 SEARCH_SIZE = 1600  # px, to which larger images are reduced for the rough search, which would take seconds

@@ -17,7 +17,7 @@ import scipy
 
 from calibration.board._corner_kernel import N_CORNER, fit_corners
 from calibration.board.target import LEAST_POINTS, grid_of
-from calibration.kit.arrays import AnyArray, Array, Indices, Mask
+from calibration.kit.types import AnyArray, Array, Indices, Mask
 
 LEAST_SIGMA = 0.05  # px, least standard deviation of a corner that no model fits
 MAX_WINDOW = 0.85  # of a square: excludes the blurred neighbouring edge

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from calibration.board.charuco import find_charuco
 from calibration.board.chessboard import SEARCH_SIZE, BoardNotFound, Located, board_in, find_corners, luminance, reduced
 from calibration.board.target import Board, Target
-from calibration.kit.arrays import AnyArray, evenly
+from calibration.kit.types import AnyArray, evenly
 
 Progress = Callable[[str, int, int], None]
 LEAST_VIEWS = 2  # with the whole board, for its size to be believed

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array, Indices
 from calibration.kit.errors import CalibrationError
+from calibration.kit.types import Array, Indices, checked
 
 LEAST_POINTS = 8  # of a view: fewer do not determine its pose
 

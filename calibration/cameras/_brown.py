@@ -1,6 +1,6 @@
 """Brown's distortion, in a form for both NumPy arrays and compiled loops."""
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 
 
 def distorted(

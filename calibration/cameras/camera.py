@@ -13,10 +13,9 @@ import scipy
 
 from calibration.cameras._brown import distorted
 from calibration.cameras.splines import LensField
-from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from calibration.kit.least_squares import solve_each
+from calibration.kit.types import Array, checked
 
 CAMERA_NAMES = ("left", "right")  # in messages and files
 INTRINSIC_PARAMETERS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 
 _STEPS = 12  # of a fixed point that converges by the slope of the field, some hundredths, per step
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.fit.stereo_model import StereoModel
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.types import Array, Mask
 
 TAILS = 4.0  # degrees of freedom of Student's distribution, the usual value if few data would determine them
 LEAST = 1e-7  # least size [rad], and relative to the board's distance: far below the uncertainty of any pose

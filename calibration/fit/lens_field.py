@@ -16,8 +16,8 @@ from calibration.cameras.splines import LensField
 from calibration.fit.pairing import GOOD_VIEWS
 from calibration.fit.refinement import FOLDS, Refinement, refined
 from calibration.fit.stereo_model import Observations
-from calibration.kit.arrays import Array
 from calibration.kit.least_squares import eliminate
+from calibration.kit.types import Array
 
 CELLS = 10  # of the spline's grid along the longer side of the image
 # Prior standard deviations of a coefficient that are tried: of the part that varies within cells, of the smooth part

@@ -15,8 +15,8 @@ import numpy as np
 from calibration.board.chessboard import BoardNotFound, CornerView, Located
 from calibration.cameras.camera import CAMERA_NAMES, Camera, by_turning, project_with_jacobians, vector_from_rotation
 from calibration.fit.stereo_model import Observations, StereoModel
-from calibration.kit.arrays import AnyArray, Array, Indices, Mask, evenly
 from calibration.kit.errors import CalibrationError
+from calibration.kit.types import AnyArray, Array, Indices, Mask, evenly
 
 FLOOR = 1e-3  # of the image's longer side: accuracy of poses by rough cameras; views that differ by less are identical
 # Ratio of distances, one hypothesis over another, above which the other one is believed: another order of the images

@@ -24,8 +24,8 @@ import scipy
 
 from calibration.cameras.camera import N_INTRINSIC, OF_CAMERAS
 from calibration.fit.stereo_model import N_STEREO, StereoModel
-from calibration.kit.arrays import Array
 from calibration.kit.least_squares import Normal, scaled_solve
+from calibration.kit.types import Array
 
 # Standard deviations, or widths of Cauchy distributions.
 FOCAL = 0.7  # of the logarithm of the focal length over the image's longer side: fields of view of 28 to 90 deg

@@ -22,10 +22,9 @@ from calibration.fit.board_motion import BoardMotion, motions, updated
 from calibration.fit.priors import Prior, board_basis, priors_of
 from calibration.fit.stereo_model import N_STEREO, Observations, StereoModel, moved, predict, predict_pixels
 from calibration.kit import least_squares
-from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array, Indices, Mask
 from calibration.kit.errors import CalibrationError
 from calibration.kit.least_squares import Minimum, Normal, normal_of_rows
+from calibration.kit.types import Array, Indices, Mask, checked
 
 FREE_ROUNDS = 6  # of robust weights, and of rejection with points accepted again; not in as many more, so that it ends
 FOLDS = 5

@@ -12,8 +12,8 @@ from calibration.board.target import LEAST_POINTS, Target
 from calibration.cameras.camera import CAMERA_NAMES, Camera, StereoRig, rotation_from_vector
 from calibration.fit.pairing import FLOOR, GOOD_VIEWS, MOST_TRIED, Names, Pairs, board_turns, paired, poses_of
 from calibration.fit.stereo_model import Observations, StereoModel
-from calibration.kit.arrays import Array, Array32, Indices, evenly
 from calibration.kit.errors import CalibrationError
+from calibration.kit.types import Array, Array32, Indices, evenly
 
 MOST_K1 = 10.0  # larger than in any real lens: above, the views do not determine it
 WIDE = 0.8  # half the image diagonal in focal lengths, 77 deg: the polynomial describes ordinary lenses below

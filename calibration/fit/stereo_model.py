@@ -5,9 +5,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, StereoRig, by_turning, rotation_from_vector
-from calibration.kit.arguments import checked
-from calibration.kit.arrays import AnyArray, Array, Indices, Mask
 from calibration.kit.errors import ArgumentError
+from calibration.kit.types import AnyArray, Array, Indices, Mask, checked
 
 N_STEREO = PAIR_SHIFT.stop  # left and right intrinsics, rotation and translation of the pair come first
 

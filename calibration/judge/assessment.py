@@ -10,8 +10,8 @@ from calibration.fit.refinement import Refinement, held_out
 from calibration.fit.start import TooWide
 from calibration.fit.stereo_model import N_STEREO
 from calibration.judge.pairs import PairMotion
-from calibration.kit.arrays import Array
 from calibration.kit.least_squares import solve_each
+from calibration.kit.types import Array
 
 MIN_COVERAGE = 0.35  # fraction of the image's 8 x 8 cells with a corner: with less, distortion is extrapolated
 MIN_TILT_SPREAD_DEG = 20.0  # between the boards' normals: with less, focal length and distance are degenerate

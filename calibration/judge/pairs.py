@@ -24,8 +24,8 @@ from calibration.fit.pairing import MIN_VIEWS, NEARER, TOO_FAR, TWICE, Names, Pa
 from calibration.fit.refinement import Refinement, fit_poses
 from calibration.fit.start import CLEARLY, start_camera
 from calibration.fit.stereo_model import N_STEREO, Observations, predict, predict_pixels
-from calibration.kit.arrays import Array
 from calibration.kit.least_squares import scaled_solve
+from calibration.kit.types import Array
 
 
 @dataclass(frozen=True)

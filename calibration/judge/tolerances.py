@@ -17,7 +17,7 @@ from calibration.cameras.camera import N_RIG, PAIR_SHIFT, WORLD_SHIFT, WORLD_TUR
 from calibration.fit.priors import PARTS, STRETCH
 from calibration.fit.refinement import Refinement
 from calibration.fit.stereo_model import N_STEREO
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 
 ASSUMED_THICKNESS = 20e-6  # [m] standard deviation of a calliper
 SIZE, FLATNESS, THICKNESS = "the board's size", "the board's flatness", "the board's thickness"

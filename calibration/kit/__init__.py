@@ -1,1 +1,1 @@
-"""Tools of both packages: array types, errors, arguments, least squares, compiled functions, grey and stuck pixels."""
+"""Tools of both packages: types, errors, least squares, compiled functions, grey and stuck pixels."""

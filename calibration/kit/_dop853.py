@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import DOP853
 
-from calibration.kit.arrays import Numbers
 from calibration.kit.compiled import exact_part, owning_part
+from calibration.kit.types import Numbers
 
 N = DOP853.n_stages  # 12; stage 12 is the rate at the end of the step, stages 13 to 15 are for the dense output
 A = np.zeros((N + 4, N + 4))

@@ -8,7 +8,7 @@ values. A sensor with a colour filter may also write grey images, with a pattern
 import cv2
 import numpy as np
 
-from calibration.kit.arrays import AnyArray
+from calibration.kit.types import AnyArray
 
 # Number of different values below which they may share a factor by chance.
 _ENOUGH_LEVELS = 16

@@ -19,7 +19,7 @@ from typing import Generic, TypeVar
 import numpy as np
 import scipy
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 
 # Rounding error of chi-square, a thousandth of a sigma: it is a sum of squared differences of pixel coordinates that
 # are a million times as large.

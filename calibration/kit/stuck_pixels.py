@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kit.arrays import AnyArray, Mask
+from calibration.kit.types import AnyArray, Mask
 
 OFF = 0.12  # of the images' range: least difference of a pixel from the median of its neighbours
 STEADY = 0.04  # of the range: largest change of a stuck pixel over the images

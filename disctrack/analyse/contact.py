@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.analyse.quantities import SIGMAS, Propagated, from_to
 
 SLIP, CONTACT = from_to("slip_n", "slip_m"), from_to("contact_x", "contact_y")

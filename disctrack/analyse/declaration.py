@@ -26,7 +26,7 @@ import numpy as np
 import scipy
 
 from calibration.cameras.camera import StereoRig, triangulate
-from calibration.kit.arrays import Array, evenly, robust_sigma
+from calibration.kit.types import Array, evenly, robust_sigma
 from disctrack.analyse.derivatives import K, MeasuredMotion, differentiate
 from disctrack.analyse.quantities import COLUMN, SIGMAS, quantities
 from disctrack.disc import Disc, has_mirror_axis, symmetry_order

@@ -12,9 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array, Indices, Mask
 from calibration.kit.brief import Brief
+from calibration.kit.types import Array, Indices, Mask, checked
 from disctrack import frames
 from disctrack.analyse.smoothing import HALF_WINDOW_LENGTHS, SEGMENT, fit_process, moving_weights
 from disctrack.disc import Disc

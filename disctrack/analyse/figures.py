@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.power_laws import MODEL_EXPONENTS
 from disctrack.disc import MA_2014

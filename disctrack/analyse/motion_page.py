@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calibration.kit.arrays import AnyArray, Array, Indices, evenly
+from calibration.kit.types import AnyArray, Array, Indices, evenly
 from disctrack.analyse.analysis import Analysis
 from disctrack.files.json_text import plain
 from disctrack.findings import carried

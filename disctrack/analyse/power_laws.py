@@ -15,8 +15,8 @@ from scipy.optimize import least_squares
 from scipy.signal import find_peaks
 from scipy.special import stdtrit
 
-from calibration.kit.arrays import Array, Indices
 from calibration.kit.brief import Brief
+from calibration.kit.types import Array, Indices
 from disctrack.analyse.derivatives import MIN_FRAMES
 from disctrack.disc import Disc, nutation_frequency, precession_rate
 from disctrack.errors import ModelError

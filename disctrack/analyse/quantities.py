@@ -16,8 +16,8 @@ from typing import Annotated
 
 import numpy as np
 
-from calibration.kit.arrays import Array, Indices
 from calibration.kit.brief import Brief
+from calibration.kit.types import Array, Indices
 from disctrack.analyse.derivatives import K, MeasuredMotion, MotionState
 from disctrack.disc import Disc, precession_rate
 from disctrack.errors import ModelError

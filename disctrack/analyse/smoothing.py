@@ -15,7 +15,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from calibration.kit.arrays import Array, Indices
+from calibration.kit.types import Array, Indices
 
 LENGTHS = 2.0 * 1.15 ** np.arange(20)  # l in frame intervals: 2 (content up to the Nyquist rate) to 28
 RATIOS = 10.0 ** np.arange(0.0, 10.1, 0.5)  # (A / sigma)^2

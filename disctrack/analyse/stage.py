@@ -7,9 +7,9 @@ from typing import get_type_hints
 
 import numpy as np
 
-from calibration.kit.arguments import Seconds, checked
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
+from calibration.kit.types import Seconds, checked
 from disctrack.analyse.analysis import CIRCLE_DURATION, WINDOWS, Analysis, analyse
 from disctrack.analyse.derivatives import CHANNELS, N_STATE, STATE, MeasuredMotion
 from disctrack.analyse.power_laws import WINDOW

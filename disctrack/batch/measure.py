@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from filelock import Timeout
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from calibration.rig_file import read_rig
 from disctrack.analyse.analysis import Analysis, analyse
 from disctrack.analyse.power_laws import PowerLaws

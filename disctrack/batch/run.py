@@ -14,7 +14,7 @@ from pathlib import Path
 from filelock import Timeout
 from tqdm import tqdm
 
-from calibration.kit.arguments import checked
+from calibration.kit.types import checked
 from disctrack.batch.columns import COLUMNS, PATHS, REPEATS, Row, repeats_of
 from disctrack.batch.locks import locked
 from disctrack.batch.plan import BatchOptions, FoundRecordings, Job, find_recordings, make_plan

@@ -11,7 +11,7 @@ from calibration import BoardTolerances, StereoCalibration, StereoRig
 from calibration.board import corner_fit
 from calibration.board.search import Progress
 from calibration.board.target import Target, described
-from calibration.kit.arguments import checked
+from calibration.kit.types import checked
 from calibration.rig_file import Record, complete_rig, read_rig, read_rig_file, rig_bytes
 from disctrack.analyse.declaration import Boards
 from disctrack.calibrate.views import TargetImages, calibrate_views, declared_views

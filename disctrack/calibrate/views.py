@@ -7,9 +7,8 @@ from pathlib import Path
 from calibration import BoardTolerances, StereoCalibration, calibrate_stereo
 from calibration.board.search import Progress
 from calibration.board.target import Target
-from calibration.kit.arguments import Thickness, checked
-from calibration.kit.arrays import AnyArray
 from calibration.kit.brief import Brief
+from calibration.kit.types import AnyArray, Thickness, checked
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import CalibrationViews, Recording

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from calibration import StereoRig
-from calibration.kit.arrays import AnyArray
+from calibration.kit.types import AnyArray
 from disctrack.calibrate.stage import boards_in
 from disctrack.commands import DONE, INCOMPLETE
 from disctrack.files.json_text import json_text

@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from calibration.kit.arrays import AnyArray
+from calibration.kit.types import AnyArray
 from disctrack.analyse.analysis import Analysis
 from disctrack.analyse.motion_page import motion_html
 from disctrack.analyse.stage import run_analyse

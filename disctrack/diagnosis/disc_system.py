@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
+from calibration.kit.types import Array
 from disctrack.diagnosis import motion
 from disctrack.diagnosis.law_library import LearnedLaw
 from disctrack.diagnosis.starts import STRETCHES, shape_guesses, start_values

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import trapezoid
 
-from calibration.kit.arrays import Indices
+from calibration.kit.types import Indices
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import state_of
 from disctrack.diagnosis.stretch import MIN_FRAMES

@@ -24,8 +24,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.linalg import solve_triangular
 
-from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
+from calibration.kit.types import Array
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.law_library import LearnedLaw
 from disctrack.diagnosis.missing_force import WIDTH, Course, Probed, probe

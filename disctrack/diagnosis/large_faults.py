@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import measurement_candidates
 from disctrack.diagnosis.systematic import Systematic, find_systematic, with_noise_of_frames

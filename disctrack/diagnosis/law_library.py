@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.disc import Disc
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.significance import SURE, as_sigmas, wald

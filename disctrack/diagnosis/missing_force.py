@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from calibration.kit.arrays import Array, Indices
 from calibration.kit.least_squares import triangle
+from calibration.kit.types import Array, Indices
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.law_library import SHAPES, Family, LearnedLaw, families
 from disctrack.diagnosis.motion import STATE_SCALES, THETA_END, state_of

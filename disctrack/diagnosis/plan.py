@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
+from calibration.kit.types import Array
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import state_of, state_quantities
 from disctrack.diagnosis.stretch import MIN_FRAMES, MIN_THETA

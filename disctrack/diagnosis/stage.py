@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.kit.arguments import checked
 from calibration.kit.brief import Brief
 from calibration.kit.threads import one_blas_thread
+from calibration.kit.types import checked
 from disctrack.diagnosis.answer import DiscDiagnosis, Learned
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import ResidualTests, energy_balance, errors, ranges_text, residual_tests, valid_ranges

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.signal import find_peaks, periodogram
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.analyse.derivatives import MeasuredMotion, differentiate
 from disctrack.analyse.quantities import COLUMN, from_to, quantities
 from disctrack.analyse.smoothing import SEGMENT

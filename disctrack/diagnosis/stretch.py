@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array, Indices, Mask
+from calibration.kit.types import Array, Indices, Mask
 from disctrack.errors import AnalysisError
 from disctrack.frames import rotation_from_euler, vector_from_rotation
 from disctrack.track.side_by_side import stretches

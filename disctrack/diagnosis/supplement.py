@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.analyse.derivatives import K, differentiate
 from disctrack.analyse.quantities import COLUMN, energy_of, from_to, propagate
 from disctrack.diagnosis.answer import DiscDiagnosis

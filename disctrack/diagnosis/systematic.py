@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.types import Array, Mask
 from disctrack.diagnosis.stretch import MIN_FRAMES
 from disctrack.discrepancy.noise import THIRD
 from disctrack.discrepancy.significance import SURE

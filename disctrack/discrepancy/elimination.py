@@ -12,8 +12,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from calibration.kit.arrays import Array, Indices
 from calibration.kit.least_squares import OwnNumbers, eliminate, triangle
+from calibration.kit.types import Array, Indices
 from disctrack.discrepancy.system import Quantity, System, Values
 
 _KNOWN: "WeakKeyDictionary[System, dict[tuple[object, ...], Projection]]" = WeakKeyDictionary()

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
 from calibration.kit.least_squares import OwnNumbers, covariance_within, solve_bounded
+from calibration.kit.types import Array
 from disctrack.discrepancy.elimination import Own, Projection, is_linear, prior_rows, projection
 from disctrack.discrepancy.system import GivenUp, Quantity, System, Values
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibration.kit.arrays import Array, Mask
 from calibration.kit.least_squares import OwnNumbers, triangle
+from calibration.kit.types import Array, Mask
 from disctrack.discrepancy.elimination import Own
 from disctrack.discrepancy.fit import Fit, fit
 from disctrack.discrepancy.score import INVISIBLE, cleared, span

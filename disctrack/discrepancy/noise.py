@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.stats import norm
 
-from calibration.kit.arrays import Array, Indices, Mask
+from calibration.kit.types import Array, Indices, Mask
 from disctrack.discrepancy.elimination import Own, is_linear, projection
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.significance import SURE

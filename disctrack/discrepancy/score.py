@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.kit.arrays import Array
 from calibration.kit.least_squares import solve_bounded
+from calibration.kit.types import Array
 from disctrack.discrepancy.elimination import Own, is_linear, prior_rows, projection
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.system import Candidate, System

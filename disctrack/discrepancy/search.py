@@ -16,8 +16,8 @@ from typing import Literal, TypeVar
 import numpy as np
 from scipy import stats
 
-from calibration.kit.arrays import Mask
 from calibration.kit.brief import Brief
+from calibration.kit.types import Mask
 from disctrack.discrepancy.fit import Fit, attempt, fit
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import THIRD, inflation, noise_variance, whitened

@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from scipy import signal, special, stats
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.discrepancy.score import Linearisation, Score, span
 
 FALSE_ALARM = 0.005  # probability that noise alone produces a finding, over all that is tested

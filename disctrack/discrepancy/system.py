@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.types import Array, Mask
 
 Values = Mapping[str, float]
 USED_UP = "the search ended when its work was used up: not all that may be missing was tried"

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.discrepancy.equations import Answer, Equations, Parameter, Run, SmoothNoise, Term, diagnose
 from disctrack.discrepancy.noise import SampleStretch, estimate
 from disctrack.discrepancy.search import CLASS_GAIN, Settings

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.io import loadmat
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.discrepancy.equations import Answer, Equations, Parameter, Run, Term, diagnose, terms
 from disctrack.errors import AnalysisError
 from disctrack.examples._command import Outcome, command

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.types import Array, Mask
 from disctrack.analyse.derivatives import K as UP
 from disctrack.discrepancy.document import effect_text
 from disctrack.discrepancy.noise import SampleStretch, SmoothNoise, estimate

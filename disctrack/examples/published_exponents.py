@@ -28,7 +28,7 @@ import numpy as np
 from scipy import stats
 from scipy.interpolate import CubicSpline
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.diagnosis.motion import motion_candidates
 from disctrack.disc import MA_2014, Disc
 from disctrack.discrepancy.fit import Fit

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.disc import Disc
 from disctrack.faults.dots import Sight, ellipse_centre_shift, predict
 from disctrack.faults.keys import Faults

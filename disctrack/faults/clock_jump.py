@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.kit.arrays import Array, Indices, Mask
+from calibration.kit.types import Array, Indices, Mask
 from disctrack.frames import rotation_from_quaternion
 from disctrack.trajectory import Trajectory
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibration.cameras.camera import Camera, StereoRig, by_turning, placed, project_with_jacobians
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.disc import Disc
 from disctrack.faults.keys import Faults
 from disctrack.frames import rotation_from_vector, rotation_z

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.files.toml_tree import MOST, NOT_NEGATIVE, POSITIVE, limited
 
 Pair = tuple[float, float]

@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calibration.kit.arrays import AnyArray
+from calibration.kit.types import AnyArray
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from calibration import StereoCalibration, StereoRig
-from calibration.kit.arrays import AnyArray, evenly
+from calibration.kit.types import AnyArray, evenly
 from calibration.rig_file import record_of
 from disctrack.analyse.declaration import Boards, across, contradictions, lost_pairs, turned_board
 from disctrack.calibrate.stage import boards_in, boards_of, given_rig, noticed_in, source_of

@@ -18,7 +18,7 @@ import numpy as np
 
 from calibration.board.chessboard import BoardNotFound, find_corners
 from calibration.board.search import VIEWS_TRIED, board_size
-from calibration.kit.arrays import AnyArray, evenly
+from calibration.kit.types import AnyArray, evenly
 from calibration.rig_file import read_rig
 from disctrack.calibrate.views import pixels_of, views_of
 from disctrack.errors import DiscTrackError, OutputError, RecordingError

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from calibration import StereoCalibration
 from calibration.board.chessboard import luminance
-from calibration.kit.arrays import AnyArray
+from calibration.kit.types import AnyArray
 from disctrack.first_look.check import Check
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.decoding import decode

@@ -10,8 +10,8 @@ from typing import Any, ClassVar, NamedTuple
 
 from calibration.board.target import Board, CharucoBoard, Target
 from calibration.judge.tolerances import BoardTolerances
-from calibration.kit.arguments import checked
 from calibration.kit.brief import Brief
+from calibration.kit.types import checked
 from disctrack.disc import AIR_DENSITY, STANDARD_PRESSURE, Disc, disc_from_mm
 from disctrack.errors import CalibrationError, RecordingError, told_as
 from disctrack.files.toml_tree import read_toml, toml_value

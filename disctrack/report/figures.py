@@ -12,7 +12,7 @@ from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.files.whole import write_whole
 from disctrack.report.palette import GRID, INK, MUTED
 

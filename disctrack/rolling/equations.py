@@ -43,8 +43,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from calibration.kit.arrays import Numbers
 from calibration.kit.compiled import exact_part
+from calibration.kit.types import Numbers
 from disctrack.rolling._compiled import Addresses, call
 from disctrack.rolling.records import Record, Regime
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.kit import _dop853 as dop853
-from calibration.kit.arrays import Array, Numbers
 from calibration.kit.compiled import exact_part, njit
+from calibration.kit.types import Array, Numbers
 from disctrack.rolling._compiled import call
 
 RTOL_IMAGINARY = 1e-7  # fifth-order error per step; the relative error of the derivatives is then about 1e-9

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.kit.arguments import Density, Gravity, checked
+from calibration.kit.types import Density, Gravity, checked
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import ModelError
 from disctrack.rolling.effects.base import CATALOGUE, Effect, EffectParameter, effect_class

@@ -8,8 +8,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibration.kit.arrays import Array
 from calibration.kit.brief import Brief
+from calibration.kit.types import Array
 from disctrack.frames import COORDINATES, nodal_axes_world, rotation_from_euler
 from disctrack.rolling.effects.base import Effect
 from disctrack.rolling.model import Model

@@ -21,8 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_simpson
 
-from calibration.kit.arguments import FrameRate, Seconds, Times, checked
-from calibration.kit.arrays import Array, Numbers
+from calibration.kit.types import Array, FrameRate, Numbers, Seconds, Times, checked
 from disctrack.disc import MA_2014
 from disctrack.errors import ModelError
 from disctrack.files.toml_tree import MOST

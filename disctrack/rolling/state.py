@@ -4,8 +4,7 @@ from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
-from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array, checked
 from disctrack.disc import Disc, followers, nutation_frequency, precession_rate
 from disctrack.errors import ModelError
 

@@ -12,8 +12,8 @@ corrected for curvature to second order. The error of a blurred edge is of third
 import numpy as np
 from numba import types
 
-from calibration.kit.arrays import Array, Array32
 from calibration.kit.compiled import exact_part, njit, owning_part
+from calibration.kit.types import Array, Array32
 
 _ROUND, _BODY, _SHEET = 0.0, 1.0, 2.0
 _FAR = -1e3  # [m] signed distance of a ray that does not meet the plane in front of the camera

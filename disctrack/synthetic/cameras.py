@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.cameras.camera import Camera, StereoRig, placed, project
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.errors import SceneError
 from disctrack.frames import rotation_from_vector
 from disctrack.synthetic.description import Scene

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from calibration.cameras.camera import Camera, StereoRig
-from calibration.kit.arrays import Array, Array32
+from calibration.kit.types import Array, Array32
 from disctrack.disc import Disc
 from disctrack.faults.keys import Occluder
 from disctrack.frames import CAMERAS, rotation_from_euler

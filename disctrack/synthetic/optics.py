@@ -11,8 +11,8 @@ import numpy as np
 from scipy.special import erf
 
 from calibration.cameras.camera import Camera, normalise
-from calibration.kit.arrays import Array, Array32, Image
 from calibration.kit.compiled import njit
+from calibration.kit.types import Array, Array32, Image
 from disctrack.errors import SceneError
 from disctrack.synthetic._raster_kernel import between
 from disctrack.synthetic.cameras import View

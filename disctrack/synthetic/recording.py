@@ -13,8 +13,7 @@ import numpy as np
 from scipy.interpolate import PPoly
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array, Array32
+from calibration.kit.types import Array, Array32, checked
 from calibration.rig_file import write_rig_group
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.errors import OutputError, told_as

@@ -8,8 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from calibration.kit.arguments import checked
 from calibration.kit.brief import Brief
+from calibration.kit.types import checked
 from disctrack.errors import SceneError
 from disctrack.files.labelled_arrays import Variable, flags, write_variables
 from disctrack.files.software import __version__

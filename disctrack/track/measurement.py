@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arguments import FrameRate, Gravity, Threads, Times, checked, grey_values
-from calibration.kit.arrays import AnyArray
 from calibration.kit.threads import one_blas_thread
+from calibration.kit.types import AnyArray, FrameRate, Gravity, Threads, Times, checked, grey_values
 from disctrack.analyse.declaration import Boards, contradictions
 from disctrack.disc import Disc
 from disctrack.errors import RecordingError, TrackingError

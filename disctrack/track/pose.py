@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calibration.cameras.camera import N_RIG, StereoRig, by_turning
-from calibration.kit.arrays import AnyArray, Array, Indices, Mask
 from calibration.kit.least_squares import normal_of_rows
+from calibration.kit.types import AnyArray, Array, Indices, Mask
 from disctrack.analyse.quantities import SIGMAS
 from disctrack.disc import Disc
 from disctrack.faults.dots import marker_pixels

@@ -7,8 +7,8 @@ import numpy as np
 
 from calibration import StereoCalibration, StereoRig
 from calibration.cameras.camera import OF_CAMERAS, PAIR_SHIFT, PAIR_TURN
-from calibration.kit.arrays import Array
 from calibration.kit.brief import SHOWN_RANGES, ranges
+from calibration.kit.types import Array
 from disctrack.frames import CAMERAS, vector_from_rotation
 from disctrack.numbers import measured
 from disctrack.trajectory import FrameStatus, Trajectory

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from calibration.kit.arrays import Indices, Mask
+from calibration.kit.types import Indices, Mask
 
 AT_ONCE = 512  # frames, whose temporary arrays are many times as large as the result, and fit into a core's cache
 SHARED_FRAMES = 400  # at most, to estimate what all frames share: more frames repeat it

@@ -9,9 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibration.kit.arguments import checked
-from calibration.kit.arrays import AnyArray, Array, Mask
 from calibration.kit.grey_levels import full_scale
+from calibration.kit.types import AnyArray, Array, Mask, checked
 from disctrack.errors import OutputError
 from disctrack.files.whole import whole_file
 from disctrack.frames import CAMERAS, nodal_axes_world, rotation_from_quaternion

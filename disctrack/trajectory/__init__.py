@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, ClassVar, TypeVar
 import numpy as np
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arrays import AnyArray, Array, Codes, Indices, Mask
 from calibration.kit.brief import Brief
+from calibration.kit.types import AnyArray, Array, Codes, Indices, Mask
 from disctrack.disc import AIR_DENSITY, Disc
 from disctrack.findings import Finding
 from disctrack.frames import euler_jacobian

@@ -17,9 +17,8 @@ import h5py
 import numpy as np
 
 from calibration.cameras.camera import RIG_PARAMETERS, StereoRig
-from calibration.kit.arguments import checked
-from calibration.kit.arrays import AnyArray, Mask
 from calibration.kit.brief import Brief
+from calibration.kit.types import AnyArray, Mask, checked
 from calibration.rig_file import beside_cameras, complete_file, read_beside_cameras, sealed, versions, write_attributes
 from disctrack.disc import Disc
 from disctrack.errors import OutputError, TrajectoryFileError, told_as

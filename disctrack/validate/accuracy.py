@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.analyse.declaration import CLAIM_POSITION
 from disctrack.frames import COORDINATES, POSE_COMPONENTS
 from disctrack.trajectory import joined, part

@@ -21,7 +21,7 @@ from warnings import catch_warnings
 import cv2
 import numpy as np
 
-from calibration.kit.arrays import AnyArray, Array
+from calibration.kit.types import AnyArray, Array
 from calibration.rig_file import read_rig, write_rig
 from disctrack.errors import DiscTrackError
 from disctrack.faults.catalogue import FAULTS, HEIGHT, MOVED, TYPICAL_STEPS, Fault, each_of

@@ -13,8 +13,8 @@ import numpy as np
 
 from calibration.board.target import Board
 from calibration.cameras.camera import N_RIG, StereoRig, by_turning
-from calibration.kit.arrays import Array
 from calibration.kit.least_squares import normal_of_rows
+from calibration.kit.types import Array
 from disctrack.disc import Disc
 from disctrack.errors import DiscTrackError
 from disctrack.faults.catalogue import scene_faults

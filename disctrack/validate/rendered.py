@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arrays import AnyArray, Array, Mask
+from calibration.kit.types import AnyArray, Array, Mask
 from disctrack.calibrate.stage import calibrate_recording
 from disctrack.disc import Disc
 from disctrack.errors import SceneError

@@ -9,7 +9,7 @@ import numpy as np
 
 from calibration import Board, Camera, CornerView, Observations, StereoModel, StereoRig
 from calibration.cameras.camera import project, rotation_from_vector
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.signal import periodogram
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.diagnosis.answer import DiscDiagnosis
 from disctrack.diagnosis.errors import frequencies, simulated
 from disctrack.diagnosis.missing_force import Course

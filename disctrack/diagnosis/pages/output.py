@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.diagnosis.answer import DiscDiagnosis, Learned
 from disctrack.diagnosis.errors import Ahead, Errors
 from disctrack.diagnosis.law_library import locked

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.large_faults import large_faults
 from disctrack.diagnosis.model_file import PAPER, declared_model

@@ -15,8 +15,8 @@ from numba import types
 from numpy.typing import NDArray
 
 from calibration.kit import _dop853 as dop853
-from calibration.kit.arrays import Array
 from calibration.kit.compiled import exact_part, njit, owning_part
+from calibration.kit.types import Array
 
 _f, _v, _m, _cube = types.float64, types.float64[::1], types.float64[:, ::1], types.float64[:, :, ::1]
 # rhs(t, y, p, u, u_rate, f, J, P): f (n,), J = df/dy (n, n), P = df/dp (n, n_p) are filled in

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.discrepancy.document import document, effect_text, tables
 from disctrack.discrepancy.elimination import prior_rows
 from disctrack.discrepancy.equations import shooting

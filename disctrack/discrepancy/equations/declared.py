@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.discrepancy.equations.expressions import Formula, check_known, check_name
 from disctrack.discrepancy.noise import SmoothNoise
 from disctrack.errors import AnalysisError, told_as

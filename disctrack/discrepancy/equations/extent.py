@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from calibration.kit.arrays import Array, Indices
+from calibration.kit.types import Array, Indices
 from disctrack.discrepancy.bisection import most_that_hold
 from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations.system import EquationSystem

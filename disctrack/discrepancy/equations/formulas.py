@@ -9,8 +9,8 @@ import numpy as np
 import sympy
 from numba.core.types import CompileResultWAP
 
-from calibration.kit.arrays import Array
 from calibration.kit.compiled import compiled, function_of, njit
+from calibration.kit.types import Array
 from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Samples, Term
 from disctrack.discrepancy.equations.expressions import Formula, check_known, check_name, parsed, smooth, source_of

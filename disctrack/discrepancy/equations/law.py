@@ -19,7 +19,7 @@ import numpy as np
 from scipy import linalg
 from scipy.spatial import KDTree
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.discrepancy import search
 from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations.declared import Equations, Parameter, Samples, Term

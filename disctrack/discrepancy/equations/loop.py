@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import qr
 
-from calibration.kit.arrays import Array
 from calibration.kit.threads import one_blas_thread
+from calibration.kit.types import Array
 from disctrack.discrepancy import noise
 from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations import terms as library

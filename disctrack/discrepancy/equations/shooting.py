@@ -12,7 +12,7 @@ import numpy as np
 from scipy import signal
 from scipy.optimize import least_squares
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.discrepancy.elimination import prior_rows
 from disctrack.discrepancy.equations.declared import Samples
 from disctrack.discrepancy.equations.formulas import Formulas

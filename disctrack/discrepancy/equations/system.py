@@ -7,7 +7,7 @@ from itertools import accumulate, pairwise
 import numpy as np
 from scipy.interpolate import PPoly
 
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.types import Array, Mask
 from disctrack.discrepancy.equations import _ode_kernel as kernel
 from disctrack.discrepancy.equations.declared import Samples, Term
 from disctrack.discrepancy.equations.formulas import Formulas

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import stats
 from scipy.optimize import least_squares
 
-from calibration.kit.arrays import Array, Indices
+from calibration.kit.types import Array, Indices
 from disctrack.discrepancy.score import INVISIBLE
 from disctrack.discrepancy.significance import FALSE_ALARM
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
+from calibration.kit.types import Array
 from disctrack.discrepancy.elimination import prior_rows
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.sharing import JointSystem

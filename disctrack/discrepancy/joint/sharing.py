@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from calibration.kit.arrays import Array
 from calibration.kit.least_squares import eliminate
+from calibration.kit.types import Array
 from disctrack.discrepancy.elimination import is_linear, prior_rows, projection
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.joint.crew import Crew

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from calibration.kit.arrays import Array
 from calibration.kit.least_squares import triangle
+from calibration.kit.types import Array
 from disctrack.discrepancy.fit import Fit
 from disctrack.discrepancy.joint.covariates import Hypothesis, hypotheses
 from disctrack.discrepancy.joint.crew import Crew

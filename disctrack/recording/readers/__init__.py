@@ -3,7 +3,7 @@
 from importlib import import_module
 from pathlib import Path
 
-from calibration.kit.arguments import checked
+from calibration.kit.types import checked
 from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers.base import FrameReader
 from disctrack.recording.readers.files import FORMATS, IMAGES, NUMBER, match_files, split_member

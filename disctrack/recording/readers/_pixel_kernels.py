@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from calibration.kit.arrays import AnyArray
 from calibration.kit.compiled import njit
+from calibration.kit.types import AnyArray
 
 
 def prepare() -> None:

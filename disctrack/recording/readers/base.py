@@ -10,7 +10,7 @@ from typing import NoReturn, TypeVar
 
 import numpy as np
 
-from calibration.kit.arrays import AnyArray, Array, Image
+from calibration.kit.types import AnyArray, Array, Image
 from disctrack.errors import RecordingError
 
 

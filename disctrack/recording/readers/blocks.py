@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kit.arguments import Threads, checked
-from calibration.kit.arrays import AnyArray, Mask
+from calibration.kit.types import AnyArray, Mask, Threads, checked
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers.base import FrameReader, in_words

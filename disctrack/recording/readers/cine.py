@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import CameraHeader, FrameReader, in_words, only_file, refuse_colour
 from disctrack.recording.readers.raw import PixelLayout, RawFile, bit_depth_of, check_frame_size, raw_frames

@@ -13,7 +13,7 @@ import cv2
 import imagecodecs
 import numpy as np
 
-from calibration.kit.arrays import AnyArray, Image
+from calibration.kit.types import AnyArray, Image
 from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers._pixel_kernels import undo_filters
 from disctrack.recording.readers.base import refuse_colour, room_for

@@ -16,8 +16,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calibration.kit.arrays import Array32, Image, Mask
 from calibration.kit.stuck_pixels import MOST, repair
+from calibration.kit.types import Array32, Image, Mask
 from disctrack.errors import RecordingError
 from disctrack.frames import CAMERAS
 from disctrack.recording.readers import open_frames

@@ -13,7 +13,7 @@ from typing import Any, cast
 import h5py
 import numpy as np
 
-from calibration.kit.arrays import Array, Image
+from calibration.kit.types import Array, Image
 from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers import raw
 from disctrack.recording.readers.base import FrameReader, only_file, room_for

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from calibration.kit.arrays import AnyArray, Array, Image
+from calibration.kit.types import AnyArray, Array, Image
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader, first_readable
 from disctrack.recording.readers.decoding import as_grey, decode

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration.kit.arrays import AnyArray, Image
+from calibration.kit.types import AnyArray, Image
 from disctrack.errors import RecordingError, told_as
 from disctrack.files.whole import open_regular
 from disctrack.recording.readers._pixel_kernels import unpack

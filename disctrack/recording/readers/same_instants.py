@@ -9,8 +9,8 @@ from functools import partial
 
 import numpy as np
 
-from calibration.kit.arrays import Array
 from calibration.kit.brief import ranges
+from calibration.kit.types import Array
 from disctrack.errors import RecordingError
 from disctrack.findings import Finding, Kind, Severity
 from disctrack.recording.readers.base import CameraHeader, FrameReader

@@ -12,7 +12,7 @@ from itertools import count
 import numpy as np
 import tifffile
 
-from calibration.kit.arrays import AnyArray
+from calibration.kit.types import AnyArray
 from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers._pixel_kernels import lzw_codes_follow
 from disctrack.recording.readers.raw import MOST_PIXELS, PixelLayout, RawFile, check_frame_size

@@ -14,8 +14,8 @@ from av.container import InputContainer
 from av.video.plane import VideoPlane
 from numpy.typing import NDArray
 
-from calibration.kit.arrays import Image
 from calibration.kit.brief import ranges
+from calibration.kit.types import Image
 from disctrack.errors import RecordingError, told_as
 from disctrack.recording.readers.base import FrameReader, first_readable, only_file
 from disctrack.recording.readers.decoding import as_grey

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 
 from calibration.cameras.camera import StereoRig, normalise, triangulate
-from calibration.kit.arrays import AnyArray, Array
 from calibration.kit.grey_levels import level_step
+from calibration.kit.types import AnyArray, Array
 from disctrack.analyse.declaration import SIDE_TOLERANCE
 from disctrack.disc import Disc
 from disctrack.faults.dots import marker_pixels

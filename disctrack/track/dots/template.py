@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from calibration.kit.arrays import AnyArray, Array, Codes, Image, robust_sigma
 from calibration.kit.grey_levels import level_step
+from calibration.kit.types import AnyArray, Array, Codes, Image, robust_sigma
 from disctrack.disc import Disc
 from disctrack.trajectory import MarkerStatus
 

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.cameras.camera import StereoRig, normalised_maps
-from calibration.kit.arrays import AnyArray, Array, Codes, Image, Mask
 from calibration.kit.grey_levels import saturation_level
+from calibration.kit.types import AnyArray, Array, Codes, Image, Mask
 from disctrack.disc import Disc, symmetry_order
 from disctrack.frames import rotation_from_vector, rotation_z, vector_from_rotation
 from disctrack.track.dots import _kernels as kernels

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arguments import checked, grey_values
-from calibration.kit.arrays import AnyArray, Array, Image
+from calibration.kit.types import AnyArray, Array, Image, checked, grey_values
 from disctrack import frames
 from disctrack.disc import Disc
 from disctrack.errors import ArgumentError

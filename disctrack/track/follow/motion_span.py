@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from calibration.kit.arrays import AnyArray, Array32, robust_sigma
 from calibration.kit.grey_levels import level_step
+from calibration.kit.types import AnyArray, Array32, robust_sigma
 from disctrack.analyse.quantities import SIGMAS
 from disctrack.errors import RecordingError
 from disctrack.recording.readers.base import FrameReader

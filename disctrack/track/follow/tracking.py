@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from calibration.cameras.camera import Camera, StereoRig
-from calibration.kit.arrays import AnyArray, Mask
 from calibration.kit.grey_levels import mosaic_gains
 from calibration.kit.stuck_pixels import repair, stuck_pixels
+from calibration.kit.types import AnyArray, Mask
 from disctrack import frames
 from disctrack.disc import MA_2014, Disc, symmetry_order
 from disctrack.errors import TrackingError

@@ -16,7 +16,7 @@ a rotation explains hardly any of them.
 import numpy as np
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, WORLD_SHIFT, WORLD_TURN, StereoRig
-from calibration.kit.arrays import Array, Mask
+from calibration.kit.types import Array, Mask
 from disctrack.analyse.quantities import SIGMAS
 from disctrack.findings import MISFITS, Finding, Kind, Remedy, Severity, Subject
 from disctrack.frames import CAMERAS, vector_from_rotation

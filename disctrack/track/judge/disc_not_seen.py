@@ -21,7 +21,7 @@ import scipy
 
 from calibration.board.target import Board
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, PAIR_TURN, StereoRig, triangulate
-from calibration.kit.arrays import AnyArray, Array, Mask
+from calibration.kit.types import AnyArray, Array, Mask
 from disctrack.analyse.declaration import SIDE_TOLERANCE, other_scale
 from disctrack.disc import Disc, has_mirror_axis
 from disctrack.findings import NONSENSE, Finding, Kind, Remedy, Severity, Subject

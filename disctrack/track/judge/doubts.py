@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 import scipy
 
-from calibration.kit.arrays import Array, Mask, robust_sigma
 from calibration.kit.brief import ranges
+from calibration.kit.types import Array, Mask, robust_sigma
 from disctrack import frames
 from disctrack.analyse.declaration import LAB_FRAME
 from disctrack.analyse.derivatives import CHANNELS

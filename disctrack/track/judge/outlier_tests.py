@@ -13,7 +13,7 @@ from math import comb
 import numpy as np
 import scipy
 
-from calibration.kit.arrays import AnyArray, Array, Codes, Indices, Mask
+from calibration.kit.types import AnyArray, Array, Codes, Indices, Mask
 from disctrack.frames import rotation_from_vector, vector_from_rotation
 from disctrack.track.pose import PoseFits
 from disctrack.track.side_by_side import FEW, stretches

@@ -8,8 +8,8 @@ import numpy as np
 
 from calibration.board.target import Board
 from calibration.cameras.camera import StereoRig, causes
-from calibration.kit.arrays import AnyArray, Array, Codes, Mask
 from calibration.kit.brief import Brief
+from calibration.kit.types import AnyArray, Array, Codes, Mask
 from disctrack import frames
 from disctrack.findings import Finding
 from disctrack.recording.readers.blocks import NotRead

@@ -39,7 +39,7 @@ from itertools import product
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval2d
 
-from calibration.kit.arrays import Array, Indices, Mask
+from calibration.kit.types import Array, Indices, Mask
 from disctrack.analyse.quantities import SIGMAS
 from disctrack.findings import Finding, Kind, Severity
 from disctrack.frames import CAMERAS

@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 
 from calibration.cameras.camera import INTRINSIC_PARAMETERS, N_RIG, PAIR_SHIFT
-from calibration.kit.arrays import Array, Indices
+from calibration.kit.types import Array, Indices
 from disctrack.analyse.derivatives import CHANNELS
 from disctrack.track.judge.outlier_tests import differences, sums_over_time
 from disctrack.track.pose import DotsInFrames, PoseFits, whitening

@@ -24,8 +24,8 @@ import numpy as np
 
 from calibration.cameras.camera import N_RIG, PAIR_SHIFT, StereoRig
 from calibration.judge.tolerances import SIZE
-from calibration.kit.arrays import Array
 from calibration.kit.least_squares import scaled_solve
+from calibration.kit.types import Array
 from disctrack.disc import Disc
 from disctrack.track.pose import DotsInFrames
 from disctrack.track.side_by_side import MIN_FRAMES, SHARED_FRAMES, evenly

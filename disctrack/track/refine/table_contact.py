@@ -27,7 +27,7 @@ import numpy as np
 import scipy
 
 from calibration.cameras.camera import N_RIG, WORLD_SHIFT, WORLD_TURN, Allowance, StereoRig
-from calibration.kit.arrays import Array, Mask, robust_sigma
+from calibration.kit.types import Array, Mask, robust_sigma
 from disctrack import frames
 from disctrack.analyse.declaration import lowest_arm
 from disctrack.analyse.derivatives import K

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from calibration.cameras.camera import StereoRig
-from calibration.kit.arguments import checked
+from calibration.kit.types import checked
 from calibration.rig_file import SCHEMA as RIG
 from calibration.rig_file import check_seal, read_rig, write_rig
 from disctrack.errors import OutputError, TrajectoryFileError, told_as

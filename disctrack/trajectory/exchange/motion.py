@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from calibration.cameras.camera import normalise
-from calibration.kit.arguments import checked
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array, checked
 from disctrack.errors import OutputError, RigFileError, told_as
 from disctrack.files.whole import refuse_existing, whole_file, write_whole
 from disctrack.frames import CAMERAS, COORDINATES, rotation_from_quaternion

@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 
 from calibration.cameras.camera import Camera, StereoRig, normalise, placed, project_with_jacobians
-from calibration.kit.arrays import Array
+from calibration.kit.types import Array
 from disctrack.errors import OutputError, RigFileError, told_as
 from disctrack.files.toml_tree import MOST, toml_value
 from disctrack.files.whole import read_regular, whole_file, write_whole

@@ -1,4 +1,4 @@
-"""Conversion and check of the arguments of public functions, from their annotations.
+"""Types of both packages: arrays, and arguments of public functions, converted to their annotations and checked.
 
 An object of the packages may be given as the file that contains it, or as a result that contains it: its class states
 the reader in `read_by`, and the attribute of other results in `held_as`. A number has the unit and the bounds of its
@@ -23,8 +23,28 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibration.kit.errors import ArgumentError
 
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+AnyArray = NDArray  # of another type: grey values, records, variables of a file
+Indices = NDArray[np.intp]
+Codes = NDArray[np.uint8]  # members of an IntEnum
+Numbers = NDArray[np.inexact[Any]]  # real, or complex if imaginary parts carry derivatives
+Array32 = NDArray[np.float32]
+Image = NDArray[np.uint8] | NDArray[np.uint16]  # one image or a stack, as a camera records it
+
+
+def robust_sigma(values: NDArray[np.floating]) -> float:
+    """Standard deviation from the median absolute deviation, robust against outliers."""
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+
+
+def evenly(n: int, most: int) -> list[int]:
+    """Indices of at most `most` of n items, evenly spaced."""
+    return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most))})
+
+
 T = TypeVar("T", bound=Callable[..., Any])
-Numbers = TypeVar("Numbers", float, NDArray[np.float64])
+Sizes = TypeVar("Sizes", float, NDArray[np.float64])
 
 
 @dataclass(frozen=True)
@@ -39,7 +59,7 @@ class Range:
         most = f" to {self.most:g}" if math.isfinite(self.most) else " on"
         return f"a number from {self.least:g}{most}, in {self.unit}"
 
-    def take(self, number: Numbers) -> Numbers:
+    def take(self, number: Sizes) -> Sizes:
         """The number, unchanged. Raises ValueError."""
         if not np.all(np.isfinite(number) & (self.least <= number) & (number <= self.most)):
             raise ValueError
