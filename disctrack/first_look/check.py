@@ -123,6 +123,7 @@ def _rig(seen: Check, recording: Recording) -> StereoRig:
         rig, _ = given_rig(recording.rig_file)
         seen.seen.append(("rig", f"{recording.rig_file}: baseline {1e3 * rig.baseline:.3f} mm"))
         seen.boards = boards_in(recording.rig_file, recording)
+        seen.findings += seen.boards.findings if seen.boards else ()
         return rig
     source = source_of(recording)
     views, table = source.views, source.table_view

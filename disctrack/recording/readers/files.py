@@ -118,18 +118,19 @@ def number_files(
         number = file_number(files[0])
         return tuple(files), None if number is None else range(number, number + 1), (), ()
     columns = [_numbers_by_pattern(files, pattern)] if pattern else _numbers_by_form(files, camera)
-    clocks = {step: column for column in columns if (step := _common_step(column, given=bool(pattern)))}
+    found = [(step, column) for column in columns if (step := _common_step(column, given=bool(pattern)))]
+    clocks = {tuple(n - min(column) for n in column): (step, column) for step, column in found}
     if len(clocks) > 1:
-        clocks = {step: column for step, column in clocks.items() if not _missing(column, step)} or clocks
+        clocks = {counts: clock for counts, clock in clocks.items() if not _missing(*clock)} or clocks
     if len(clocks) > 1:
         said = f"several numbers in the names of the {camera} frames could count them"
         raise RecordingError(f'{files[0]} ...: {said}. Say which, as in {camera} = "{camera}/*_{NUMBER}.png".')
     if not clocks:
         _refuse_clock(files, columns[-1], camera)
-    ((step, column),) = clocks.items()
+    ((step, column),) = clocks.values()
     numbers, by_number = range(min(column), max(column) + 1, step), dict(zip(column, files, strict=True))
     notes, doubts = [], []
-    if missing := _missing(column, step):
+    if missing := _missing(step, column):
         n, first = len(missing), missing[0]
         lost = f"{n} file{'s' * (n > 1)} missing in the sequence, the first is number {first}"
         notes.append(f"{lost}; this camera says nothing of these frames")
@@ -195,7 +196,7 @@ def _common_step(numbers: Sequence[int], given: bool) -> int | None:
     return step if given or steps[step] == max(steps.values()) else None
 
 
-def _missing(numbers: Sequence[int], step: int) -> list[int]:
+def _missing(step: int, numbers: Sequence[int]) -> list[int]:
     return sorted(set(range(min(numbers), max(numbers) + 1, step)) - set(numbers))
 
 

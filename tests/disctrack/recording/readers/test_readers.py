@@ -101,6 +101,7 @@ def test_a_file_that_is_not_named_like_the_others_is_named_not_measured(tmp_path
         ([f"2026-11-22_10-15-59.{t}" for t in (310, 411, 509, 613)], "no common step"),
         ([f"take{take}_{i}" for take in (1, 2) for i in range(3)], "two left frames of number 0"),
         (["0", "1", "20261122"], "no common step"),
+        (["1_1", "2_2", "4_3", "5_5"], "several numbers"),  # which of them tells the lost frame?
     ],
 )
 def test_names_that_are_no_clock_stop_the_run(tmp_path, frames, names, reason):
