@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from disctrack.analyse.stage import run_analyse as run_analyse
     from disctrack.batch import run_batch as run_batch
     from disctrack.calibrate.stage import calibrate_recording as calibrate_recording
-    from disctrack.calibrate.views import calibrate_views as calibrate_views
-    from disctrack.calibrate.views import find_views as find_views
+    from disctrack.calibrate.stage import calibrate_views as calibrate_views
+    from disctrack.calibrate.stage import find_views as find_views
     from disctrack.diagnosis.stage import diagnose as diagnose
     from disctrack.diagnosis.stage import run_diagnose as run_diagnose
     from disctrack.disc import Disc as Disc

@@ -4,8 +4,7 @@ import argparse
 from pathlib import Path
 
 from calibration import Board, BoardTolerances
-from disctrack.calibrate.stage import CalibrationSource, calibrate_into, source_of
-from disctrack.calibrate.views import find_views
+from disctrack.calibrate.stage import CalibrationSource, calibrate_into, find_views, source_of
 from disctrack.commands import _outputs as outputs
 from disctrack.errors import RecordingError
 from disctrack.recording.declaration import read_recording

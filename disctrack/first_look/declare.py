@@ -20,7 +20,7 @@ from calibration.board.chessboard import BoardNotFound, find_corners
 from calibration.board.search import VIEWS_TRIED, board_size
 from calibration.kit.types import AnyArray, evenly
 from calibration.rig_file import read_rig
-from disctrack.calibrate.views import pixels_of, views_of
+from disctrack.calibrate.stage import pixels_of, views_of
 from disctrack.errors import DiscTrackError, OutputError, RecordingError
 from disctrack.files.toml_tree import read_toml
 from disctrack.files.whole import write_whole

@@ -11,7 +11,7 @@ from numpy.testing import assert_array_equal
 
 from calibration.rig_file import read_rig
 from disctrack import find_views, open_pairs, read_recording, read_trajectory
-from disctrack.calibrate.views import declared_views
+from disctrack.calibrate.stage import declared_views
 from disctrack.cli import main
 from disctrack.errors import RecordingError
 from disctrack.first_look.declare import Sequence, pair_cameras
