@@ -10,9 +10,8 @@ from calibration.kit.types import Indices
 from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.motion import state_of
 from disctrack.diagnosis.stretch import MIN_FRAMES
-from disctrack.discrepancy.bisection import most_that_hold
 from disctrack.discrepancy.fit import Fit, fit
-from disctrack.discrepancy.held_out import HeldOut
+from disctrack.discrepancy.held_out import HeldOut, most_that_hold
 from disctrack.discrepancy.significance import Whiteness, whiteness
 from disctrack.discrepancy.system import System, Values, subset
 from disctrack.rolling import Motion, simulate

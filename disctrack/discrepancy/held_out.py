@@ -1,6 +1,6 @@
 """Prediction of held-out data: fit to the first part, predict the rest; it penalises flexible models."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -120,3 +120,16 @@ def square_root(covariance: Array) -> Array:
     safe = np.where(scale > 0, scale, 1.0)
     eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
     return np.asarray(safe[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0)), float)
+
+
+def most_that_hold(holds: Callable[[int], bool], least: int, whole: int, resolution: int = 1) -> int:
+    """The most samples, fewer than the whole, for which `holds` is true; 0 if not even for the least.
+
+    By bisection: it has to hold for fewer samples, too. The result is smaller by less than the resolution.
+    """
+    if least >= whole or not holds(least):
+        return 0
+    while whole - least > resolution:
+        middle = (least + whole) // 2
+        least, whole = (middle, whole) if holds(middle) else (least, middle)
+    return least

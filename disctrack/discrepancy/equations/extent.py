@@ -13,10 +13,10 @@ import numpy as np
 from scipy import stats
 
 from calibration.kit.types import Array, Indices
-from disctrack.discrepancy.bisection import most_that_hold
 from disctrack.discrepancy.equations import shooting
 from disctrack.discrepancy.equations.system import EquationSystem
 from disctrack.discrepancy.fit import TRIAL, Fit, fit
+from disctrack.discrepancy.held_out import most_that_hold
 from disctrack.discrepancy.search import Diagnosis, is_noise
 from disctrack.discrepancy.system import GivenUp, Values
 from disctrack.numbers import measured
