@@ -6,8 +6,6 @@ CLIP : results of `disctrack run` of sample_data/clip; SECRET : of the tour, dia
 FOLDER : where the pictures go (default: `disctrack/docs/pictures`)
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

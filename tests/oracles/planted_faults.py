@@ -4,8 +4,6 @@ Each takes images (n, 2, height, width) uint8, which it changes, where the disc 
 generator. It returns the numbers of the frames that are kept; None: all of them.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

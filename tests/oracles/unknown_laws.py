@@ -8,8 +8,6 @@ Beside the answer stands the true moment about the contact, of all laws together
 numbers of which a rolling disc takes notice, for a force X at its centre and a moment M act as M - r_OA x X.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -6,8 +6,6 @@ Errors of the moment about the contact are in uN m along n0, m0, k, over the siz
 course minus the truth in its sigmas, at some ninety instants and along three axes.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 

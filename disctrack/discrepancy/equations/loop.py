@@ -59,7 +59,8 @@ def diagnose(
     notes = [note for told, _ in sensors.values() for note in told]
     if terms is None:
         limits = (library.sensor_limit(n, str(channels[n]), side) for n, (_, ends) in sensors.items() for side in ends)
-        by_name = {term.name: term for term in (*library.usual(replace(equations, observed=channels)), *limits)}
+        usual = library.usual(replace(equations, observed=channels), {name for run in runs for name in run.constants})
+        by_name = {term.name: term for term in (*usual, *limits)}
         terms = tuple(by_name.values())
     compiled = Formulas(equations, tuple(terms), channels)
     whole = EquationSystem(compiled, noise.with_noise(given), np.ones(len(compiled.states)), {})

@@ -6,7 +6,7 @@ own_..., so that formulas given as arguments refer to the parameters of the equa
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, combinations, combinations_with_replacement
 
@@ -243,13 +243,15 @@ def input_delay(v: str, u: str, gain: str, name: str = "", onto: Mapping[str, st
     return Term(name or f"delay_{u}", rates, delayed=late, parameters=tau, title=f"input {u} acts late")
 
 
-def usual(equations: Equations) -> tuple[Term, ...]:
+def usual(equations: Equations, differing: Collection[str] = ()) -> tuple[Term, ...]:
     """Default terms, by the structure of the equations; and common errors of sensors.
 
     A coordinate is a state whose declared rate is another state: rates={"x": "v", "v": ...}; that one is a velocity, as
     is a state in the unit of one: friction and springs act on it. Any other state is a level (of a tank, a charge, a
     temperature): it leaks, is fed, runs over into the first of the states that it drives. Two or three in one unit may
     be a point's, or coupled.
+    differing : constants that are not the same in all runs: terms that go with them, as another force of the equation
+        does (over a mass), are further ones
     """
     found: list[Term] = []
     written = {y: str(f).strip() for y, f in equations.rates.items()}
@@ -284,6 +286,7 @@ def usual(equations: Equations) -> tuple[Term, ...]:
         found += [spring(v, x), asymmetric_spring(v, x), cubic_spring(v, x), deflected(v, x)]
         found += [end_stop(v, x), end_stop(v, x, -1)]
     declared = Formulas(equations, (), {})
+    found += [*_with_factors(found, declared, differing)]
     for u in declared.inputs:
         slopes = {v: force.diff(u) for v, force in zip(written, declared.forces, strict=True)}
         gains = {v: str(slope) for v, slope in slopes.items() if slope != 0 and u not in slope.free_symbols}
@@ -299,3 +302,16 @@ def usual(equations: Equations) -> tuple[Term, ...]:
         if equations.inputs or len(observed) > 1:
             found.append(sensor_lag(channel))
     return (*found, clock_rate())
+
+
+def _with_factors(terms: Sequence[Term], declared: Formulas, differing: Collection[str]) -> Iterator[Term]:
+    """Terms of one equation times what its declared parts have as a factor of such constants: one over a mass."""
+    own = {symbol for name, symbol in declared.constants.items() if name in differing}
+    for v, force in zip(declared.equations.rates, declared.forces, strict=True):
+        parts = force.expand().as_ordered_terms() if own else []
+        factors = [part.as_independent(*own, as_Add=False)[1] for part in parts]
+        for factor in dict.fromkeys(f for f in factors if f.free_symbols and f.free_symbols <= own):
+            label, by = re.sub(r"\W+", "_", str(factor)), f"in proportion to {factor}"
+            for term in (term for term in terms if term.rates.keys() == {v}):
+                rates = {v: f"({factor})*({term.rates[v]})"}
+                yield replace(term, name=f"{term.name}_by_{label}", rates=rates, title=f"{term.title}, {by}")

@@ -172,6 +172,9 @@ def test_runs_share_laws_and_have_constants_lengths_and_starts_of_their_own(rng)
     answer = diagnose(fall, runs, [drag, terms.quadratic("v"), terms.viscous("v"), terms.constant("v")])
     # one law for three balls, not the one that ignores what is declared of them
     assert_found(answer, ("drag",), {"drag.c": 0.02})
+    # nor is it among the usual terms alone where another force goes with what is declared of them
+    viscous = Equations({"h": "v", "v": "-9.81 - b*per_mass*v"}, {"b": 0.5}, {"per_mass": 1.0}, units={"h": "m"})
+    assert_found(diagnose(viscous, runs), ("quadratic_v_by_per_mass",), {"quadratic_v_by_per_mass.c": 0.02})
 
 
 @pytest.mark.statistical

@@ -160,6 +160,8 @@ def test_what_is_usual_follows_from_the_structure():
     assert not any(name.startswith("overflow") for name in of_motion)
     of_two = Equations({"x": "v", "v": "-k*x", "q": "w", "w": "-k*q"}, {"k": 1.0}, units={"x": "m", "q": "rad"})
     assert not {"coupling_x_q", "across_v_w", "quadratic_v_w"} & {t.name for t in terms.usual(of_two)}
+    fall = Equations({"x": "v", "v": "-g - c*v/m"}, {"g": 9.81, "c": 1.0}, {"m": 1.0})
+    assert {"coulomb_v_by_1_m"} == {t.name for t in terms.usual(fall, {"m"}) if t.name.startswith("coulomb_v_")}
 
 
 @pytest.mark.statistical
