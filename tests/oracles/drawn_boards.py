@@ -1,7 +1,5 @@
 """A known stereo pair before a known board: what every synthetic test starts from."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2
@@ -19,7 +17,7 @@ class Scene:
     model: StereoModel
     board: Board
 
-    def with_rig(self, **changed) -> Scene:
+    def with_rig(self, **changed) -> "Scene":
         """The same boards before a changed rig."""
         return replace(self, model=replace(self.model, rig=replace(self.model.rig, **changed)))
 
@@ -45,7 +43,7 @@ class Scene:
         return Observations(view, camera, point, pixels, L @ np.swapaxes(L, 1, 2))
 
 
-def make_scene(n_views=12, inner_corners=(9, 6), square=8e-3, distortion=True, deviation=None, seed=3) -> Scene:
+def make_scene(n_views=12, inner_corners=(9, 6), square=8e-3, distortion=True, deviation=None, seed=3) -> "Scene":
     """Two cameras 0.5 m from a board that stands in `n_views` attitudes, tilted up to 45 deg."""
     rng = np.random.default_rng(seed)
     board = Board(inner_corners, square)

@@ -68,7 +68,8 @@ def diagnose(
     notes += more
     if not np.isfinite(diagnosis.before.chi_square):
         raise AnalysisError(_failure(system, diagnosis.before.values))
-    diagnosis, autocorrelated, on_noise = _prewhiten(system, diagnosis, settings)
+    declared = all(np.isfinite(s.sigma).all() for s in given)
+    diagnosis, autocorrelated, on_noise = _prewhiten(system, diagnosis, settings, declared)
     # over less than a period initial states explain nearly any motion
     short = len(system.stretches) > len(given) and shooting.longest_duration(system) < shooting.shortest_period(whole)
     if diagnosis.verdict == "nothing missing" and short:
@@ -299,9 +300,12 @@ def unidentifiable(system: EquationSystem, values: Mapping[str, float]) -> tuple
     return tuple(sorted(weak))
 
 
-def _prewhiten(system: EquationSystem, diagnosis: Diagnosis, settings: Settings) -> tuple[Diagnosis, bool, list[str]]:
+def _prewhiten(
+    system: EquationSystem, diagnosis: Diagnosis, settings: Settings, declared: bool
+) -> tuple[Diagnosis, bool, list[str]]:
     """Search again with autocorrelated noise, where the residuals are autocorrelated and small enough for noise.
 
+    declared : the noise of every sensor is: what is found leaves no more
     returns : diagnosis, whether its noise is autocorrelated, and a remark on that
     """
     if settings.noise is not None or diagnosis.held_out_before is None:
@@ -310,26 +314,35 @@ def _prewhiten(system: EquationSystem, diagnosis: Diagnosis, settings: Settings)
     coefficients, share = noise.autoregression(residual, system.present, system.blocks)
     if not coefficients.any():
         return diagnosis, False, []
-    size = float(np.sqrt(np.sum(residual**2) / max(system.present.sum(), 1)))
+    variance = _mean_square(system, diagnosis.after)
     longest = shooting.longest_stretches(system)
     lasting = noise.correlation_lag(residual, system.blocks) * float(np.median(np.diff(longest[0].time)))
     shortest_period = min(min(shooting.period(s), _decorrelation_period(s)) for s in longest)
     # slow residuals are errors of the model, although an autoregression can predict them
     as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_period
-    as_noise &= size <= NO_SENSOR
+    as_noise &= variance <= NO_SENSOR**2
     white = noise.prewhitened(system, system.blocks, coefficients, system.present)
-    base = fit(white, system.base, diagnosis.before.values) if as_noise else None
-    if base is None or not base.converged:
+    base, again = fit(white, system.base, diagnosis.before.values) if as_noise else None, None
+    if base is not None and base.converged:
+        level = replace(settings, noise=float(share * variance))
+        again = explain(white, base.values, level, system.training, _starts(diagnosis))
+        if declared and (diagnosis.verdict, again.verdict) == ("unexplained", "found"):
+            again = again if _mean_square(system, again.after) <= settings.at_noise else None
+    if again is None:
         if diagnosis.verdict != "unexplained":
             return diagnosis, False, []
+        size = float(np.sqrt(variance))
         reason = f"residuals are {size:.3g} times the noise and correlated over {lasting:.2g} s: no sensor's noise"
         diagnosis = replace(_with_residual_sigmas(system, diagnosis), reason=reason)
         return diagnosis, False, ["sigmas are scaled to the residuals, which are larger than the noise"]
-    level = float(share * size**2)
-    again = explain(white, base.values, replace(settings, noise=level), system.training, _starts(diagnosis))
     order = int(np.max(np.nonzero(coefficients)[1])) + 1
     text = f"residuals are autocorrelated over {order} sample{'s' if order > 1 else ''}; sigmas allow for that"
     return replace(again, judged=again.judged or white), True, [text]
+
+
+def _mean_square(system: EquationSystem, fitted: Fit) -> float:
+    """Of the residuals, over the variance stated."""
+    return float(np.sum(system.linearise(fitted.values, [])[0] ** 2) / max(system.present.sum(), 1))
 
 
 def _decorrelation_period(s: Samples) -> float:
