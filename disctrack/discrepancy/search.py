@@ -322,22 +322,23 @@ class _Search:
         return best, alternatives
 
     def _add_free_shapes(self, best: Explanation) -> bool:
-        """Add explanations by laws of free shape, in place of all effects or of a faint one; True if there are any.
+        """Add explanations by laws of free shape, in place of all effects or of the faintest; True if there are any.
 
         An effect whose location is unknown (a flat of the rim) has no derivative at its null, so no score proposes it.
-        It is therefore also tried in addition to effects that leave too much, and in place of a faint one of several,
+        It is therefore also tried in addition to effects that leave too much, and in place of the faintest of several,
         which may imitate it: an inertia, or a pattern that is off centre. What imitates it need not predict.
         """
         at_noise, nothing, before = self._at_noise(best.fit), self.base_model, len(self.pool)
         several = self._ranked()[0]
         if at_noise and len(several.candidates) < 2:
             return False
-        sought = [c for c in self.system.candidates if c.sought and c.name not in best.names]
+        sought = [c for c in self.system.candidates if c.sought and c.name not in best.names | several.names]
         for e in (nothing,) if at_noise or best is nothing else (nothing, best):
             below = e.fit.cost - (1.0 - WORTH_A_SHAPE) * self.noise * e.fit.excess(self.noise)
             wanted = [c for c in self.system.candidates if c.shape] if e is nothing else sought
             self._add_with_free_shape(e, wanted, 0.0, below)
-        for rest in (self._refit_without(several, c) for c in several.candidates if c.kind == "motion" and at_noise):
+        if at_noise:
+            rest = min((self._refit_without(several, c) for c in several.candidates), key=lambda e: e.fit.cost)
             gain = rest.fit.cost - several.fit.cost
             if gain <= FAINT * self.noise:
                 self._add_with_free_shape(rest, sought, FIRST_ORDER * max(gain, 0.0), several.fit.cost)
