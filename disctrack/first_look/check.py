@@ -28,7 +28,7 @@ from disctrack.recording.readers.decoding import decode
 from disctrack.report.blocks import Facts, Report, Section
 from disctrack.report.palette import INK
 from disctrack.track.follow.tracking import Measurement, Taken, track
-from disctrack.track.measurement import ImagePairs, TrackingSettings, check_rig, exposures, images_lost, open_pairs
+from disctrack.track.measurement import ImagePairs, TrackingSettings, as_declared, check_rig, images_lost, open_pairs
 from disctrack.track.run_summary import left_out, sigma_text
 from disctrack.track.video_overlay import draw_pair
 from disctrack.trajectory import Trajectory, joined
@@ -176,7 +176,7 @@ def _motion(seen: Check, recording: Recording, rig: StereoRig, pairs: ImagePairs
             continue
         total += n
         try:
-            settings = TrackingSettings(first_pass=False, exposure=exposures(recording, pairs)[0])
+            settings, _ = as_declared(TrackingSettings(first_pass=False), recording, pairs)
             taken = Taken(frames, recording.frame_rate, recording.gravity, None, settings, recording.chessboard)
             tracking = track(pairs.reading(seen.not_read), taken, rig, recording.disc)
             done.append((frames, tracking))

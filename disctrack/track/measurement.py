@@ -132,10 +132,7 @@ def measure(
         300
     """
     check_rig(rig, pairs)
-    exposure, headers = exposures(recording, pairs)
-    settings = replace(settings or TrackingSettings(), exposure=exposure)
-    if recording.table is not None:
-        settings = replace(settings, table=recording.table.source)
+    settings, headers = as_declared(settings or TrackingSettings(), recording, pairs)
     stamps = usable_times(pairs.left, recording.frame_rate)
     with compiling("tracking", 15):  # once per installation, not counted as measuring time
         prepare(np.uint8 if pairs.left.bit_depth == 8 else np.uint16)
@@ -266,15 +263,19 @@ def refuse_unreadable(recording: Recording, lost: NotRead, n: int, error: Tracki
         ) from error
 
 
-def exposures(recording: Recording, pairs: ImagePairs) -> tuple[tuple[float, float] | None, tuple[str, ...]]:
-    """Exposures of both cameras [s], None if not stated; and a note on their source."""
+def as_declared(
+    settings: TrackingSettings, recording: Recording, pairs: ImagePairs
+) -> tuple[TrackingSettings, tuple[str, ...]]:
+    """The settings with what determines the table, and the exposures if they are stated; a note on their source."""
+    table = settings.table if recording.table is None else recording.table.source
     if recording.exposure is not None:
-        return (recording.exposure, recording.exposure), ()
+        return replace(settings, table=table, exposure=(recording.exposure, recording.exposure)), ()
     headers = pairs.left.header, pairs.right.header
     left, right = (None if header is None else header.exposure for header in headers)
     if left is None or right is None:
-        return None, ()
-    return (left, right), (f"exposure {1e6 * left:g} and {1e6 * right:g} µs (left, right) as the cameras' headers say",)
+        return replace(settings, table=table, exposure=None), ()
+    said = f"exposure {1e6 * left:g} and {1e6 * right:g} µs (left, right) as the cameras' headers say"
+    return replace(settings, table=table, exposure=(left, right)), (said,)
 
 
 def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings) -> MotionSpan:
