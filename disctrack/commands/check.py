@@ -15,7 +15,7 @@ def run(arguments: argparse.Namespace) -> int:
         seen = run_check(arguments.recording, step)
     files = []
     if seen.recording is not None and not arguments.no_figures:
-        from disctrack.first_look.check import check_figure
+        from disctrack.first_look.picture import check_figure
         from disctrack.report.figures import save_figure
 
         path = arguments.output or seen.recording.folder / outputs.RESULTS / "check.png"
