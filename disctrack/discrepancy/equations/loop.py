@@ -314,24 +314,25 @@ def _prewhiten(
     coefficients, share = noise.autoregression(residual, system.present, system.blocks)
     if not coefficients.any():
         return diagnosis, False, []
-    variance = _mean_square(system, diagnosis.after)
+    size = _rms(system, residual)
     longest = shooting.longest_stretches(system)
     lasting = noise.correlation_lag(residual, system.blocks) * float(np.median(np.diff(longest[0].time)))
     shortest_period = min(min(shooting.period(s), _decorrelation_period(s)) for s in longest)
     # slow residuals are errors of the model, although an autoregression can predict them
     as_noise = diagnosis.verdict != "unexplained" or lasting <= SLOW * shortest_period
-    as_noise &= variance <= NO_SENSOR**2
+    as_noise &= size <= NO_SENSOR
     white = noise.prewhitened(system, system.blocks, coefficients, system.present)
-    base, again = fit(white, system.base, diagnosis.before.values) if as_noise else None, None
+    base = fit(white, system.base, diagnosis.before.values) if as_noise else None
+    again = None
     if base is not None and base.converged:
-        level = replace(settings, noise=float(share * variance))
+        level = replace(settings, noise=float(share * size**2))
         again = explain(white, base.values, level, system.training, _starts(diagnosis))
         if declared and (diagnosis.verdict, again.verdict) == ("unexplained", "found"):
-            again = again if _mean_square(system, again.after) <= settings.at_noise else None
-    if again is None:
+            left, _ = system.linearise(again.after.values, [])
+            as_noise = _rms(system, left) ** 2 <= settings.at_noise
+    if again is None or not as_noise:
         if diagnosis.verdict != "unexplained":
             return diagnosis, False, []
-        size = float(np.sqrt(variance))
         reason = f"residuals are {size:.3g} times the noise and correlated over {lasting:.2g} s: no sensor's noise"
         diagnosis = replace(_with_residual_sigmas(system, diagnosis), reason=reason)
         return diagnosis, False, ["sigmas are scaled to the residuals, which are larger than the noise"]
@@ -340,9 +341,9 @@ def _prewhiten(
     return replace(again, judged=again.judged or white), True, [text]
 
 
-def _mean_square(system: EquationSystem, fitted: Fit) -> float:
-    """Of the residuals, over the variance stated."""
-    return float(np.sum(system.linearise(fitted.values, [])[0] ** 2) / max(system.present.sum(), 1))
+def _rms(system: EquationSystem, residual: Array) -> float:
+    """Of the residuals, over the noise stated."""
+    return float(np.sqrt(np.sum(residual**2) / max(system.present.sum(), 1)))
 
 
 def _decorrelation_period(s: Samples) -> float:
