@@ -268,14 +268,15 @@ def as_declared(
 ) -> tuple[TrackingSettings, tuple[str, ...]]:
     """The settings with what determines the table, and the exposures if they are stated; a note on their source."""
     table = settings.table if recording.table is None else recording.table.source
+    settings = replace(settings, table=table, exposure=None)
     if recording.exposure is not None:
-        return replace(settings, table=table, exposure=(recording.exposure, recording.exposure)), ()
+        return replace(settings, exposure=(recording.exposure, recording.exposure)), ()
     headers = pairs.left.header, pairs.right.header
     left, right = (None if header is None else header.exposure for header in headers)
     if left is None or right is None:
-        return replace(settings, table=table, exposure=None), ()
+        return settings, ()
     said = f"exposure {1e6 * left:g} and {1e6 * right:g} µs (left, right) as the cameras' headers say"
-    return replace(settings, table=table, exposure=(left, right)), (said,)
+    return replace(settings, exposure=(left, right)), (said,)
 
 
 def _span(pairs: ImagePairs, frame_rate: float, settings: TrackingSettings) -> MotionSpan:
