@@ -116,7 +116,7 @@ class Tracker:
             np.concatenate([fit.t_world_body[0], angles]),
             fit.R_world_body[0],
             fit.covariance[0],
-            FrameStatus(status_of(followed, fit)[0]),
+            FrameStatus(status_of(followed, seen, fit)[0]),
             seen.pixels[0],
             fit.residuals_px[0],
             float(fit.reduced_chi_square[0]),

@@ -93,7 +93,7 @@ def assemble(followers: list[Follower], tables: Tables, taken: Taken, workers: i
     seen = replace(seen, R=fits.R_world_body, t=fits.t_world_body)
     again = np.asarray(repeated.all(axis=1))
     fits, verdicts = judge_poses(fits, again, outlying, 1 / taken.frame_rate, disc.radius)
-    status = np.where(verdicts == FrameStatus.MEASURED, status_of(tables.frame_status, fits), verdicts)
+    status = np.where(verdicts == FrameStatus.MEASURED, status_of(tables.frame_status, seen, fits), verdicts)
     by_motion, of_motion = camera_motion(seen, fits, taken.pairs)
     systematic += by_motion
     moved = by_pattern(as_built, fits.R_world_body)
@@ -198,14 +198,16 @@ def _shared_sigma(fits: PoseFits, systematic: Array, rig: StereoRig, moved: Arra
     return [[float(value), cause] for value, cause in zip(sigma, most, strict=True)]
 
 
-def status_of(followed: Codes, fits: PoseFits) -> Codes:
+def status_of(followed: Codes, seen: DotsInFrames, fits: PoseFits) -> Codes:
     """(n,) status by the fits of frames in which the disc was followed; the others keep their status."""
     status, was = followed.copy(), followed == FrameStatus.MEASURED
     per_camera = fits.used.sum(axis=2)
     total = per_camera.sum(axis=1)
     status[was & (total < 2 * MIN_DOTS)] = FrameStatus.FEW_MARKERS
     status[was & (per_camera == 0).any(axis=1)] = FrameStatus.ONE_CAMERA
-    status[was & (total < MIN_DOTS)] = FrameStatus.MARKERS_NOT_FOUND
+    found = np.isfinite(seen.pixels).all(axis=-1).sum(axis=(1, 2))
+    status[was & (total < MIN_DOTS)] = FrameStatus.NOT_CONVERGED
+    status[was & (found < MIN_DOTS)] = FrameStatus.MARKERS_NOT_FOUND
     return status
 
 

@@ -11,7 +11,9 @@ from disctrack.faults.dots import marker_pixels
 from disctrack.synthetic.cameras import rig_of
 from disctrack.synthetic.description import Scene
 from disctrack.track.pose import DotsInFrames, PoseFits, fit_poses
+from disctrack.track.refine.assembly import status_of
 from disctrack.track.refine.scatter import scatter_of_poses
+from disctrack.trajectory import FrameStatus
 
 SIGMA_PX = 0.01
 CENTRES = MA_2014.marker_centres_body
@@ -64,8 +66,7 @@ def test_jacobian_agrees_with_central_differences(rng, rig):
     assert_allclose(pixels, rig.project(CENTRES @ np.swapaxes(R, 1, 2) + t[:, None]), atol=1e-10)
     assert np.isnan(marker_pixels(R, t + 10 * rig.R_left_world[2] * [-1, -1, -1], rig, CENTRES)[0][:, 0]).all()
     for k, step in enumerate([1e-6] * 3 + [1e-5] * 3):
-        v = np.zeros(6)
-        v[k] = step
+        v = step * (np.arange(6) == k)
         ahead, _ = marker_pixels(frames.rotation_from_vector(v[3:]) @ R, t + v[:3], rig, CENTRES)
         behind, _ = marker_pixels(frames.rotation_from_vector(-v[3:]) @ R, t - v[:3], rig, CENTRES)
         numeric = (ahead - behind) / (2 * step)
@@ -98,9 +99,8 @@ def test_minimum_is_that_of_scipy(rng, rig):
         reference = least_squares(residual, np.zeros(6), x_scale=[1e-4] * 3 + [1e-3] * 3, xtol=1e-15, ftol=1e-15)
         sigma = np.sqrt(np.diag(fits.covariance[i]))
         assert_allclose(fits.t_world_body[i], start[1][i] + reference.x[:3], atol=2e-3 * sigma[:3].max())
-        turn = frames.vector_from_rotation(
-            fits.R_world_body[i] @ (frames.rotation_from_vector(reference.x[3:]) @ start[0][i]).T
-        )
+        R_reference = frames.rotation_from_vector(reference.x[3:]) @ start[0][i]
+        turn = frames.vector_from_rotation(fits.R_world_body[i] @ R_reference.T)
         assert np.abs(turn).max() < 2e-3 * sigma[3:].max()
 
 
@@ -125,14 +125,16 @@ def test_one_camera_still_gives_a_pose_with_a_larger_sigma(rng, rig):
     assert 0.7 < np.median(chi_square(one, R, t)) / 5.35 < 1.3  # median of chi-square with 6 degrees of freedom
 
 
-def test_three_dot_images_are_the_least_and_two_give_nothing(rng, rig):
-    R, t, markers, covariance = filmed(rng, 2, rig, 1e-4)
-    markers[0, 1], markers[0, 0, 3:] = np.nan, np.nan
-    markers[1, 1], markers[1, 0, 2:] = np.nan, np.nan
-    fits = fitted(markers, covariance, rig, R, t)
-    assert fits.converged.tolist() == [True, False]
-    assert np.isnan(fits.t_world_body[1]).all()
-    assert fits.degrees_of_freedom.tolist() == [0, 0]
+def test_three_dot_images_are_the_least_and_two_or_dots_at_one_place_give_nothing(rng, rig):
+    R, t, markers, covariance = filmed(rng, 3, rig, 1e-4)
+    markers[:, 1], markers[0, 0, 3:], markers[1, 0, 2:], markers[2, 0] = np.nan, np.nan, np.nan, markers[2, 0, 0]
+    seen = DotsInFrames(rig, MA_2014, markers, covariance, R, t)
+    fits = fit_poses(seen)
+    assert fits.converged.tolist() == [True, False, False]
+    assert np.isnan(fits.t_world_body[1:]).all()
+    assert fits.degrees_of_freedom.tolist() == [0, 0, 0]
+    expected = [FrameStatus.ONE_CAMERA, FrameStatus.MARKERS_NOT_FOUND, FrameStatus.NOT_CONVERGED]
+    assert status_of(np.zeros(3, np.uint8), seen, fits).tolist() == expected
 
 
 @pytest.mark.parametrize("wrong_px", [0.3, 40.0])
@@ -149,9 +151,7 @@ def test_a_wrong_dot_is_struck_and_named(rng, rig, wrong_px):
 def test_sensitivity_tells_where_the_pose_goes_when_the_rig_changes(rng, rig):
     R, t, markers, covariance = filmed(rng, 5, rig)
     fits = fitted(markers, covariance, rig, R, t)
-    scale = np.array(
-        [1.0, 1, 1, 1, 1e-3, 1e-2, 1e-4, 1e-4, 0.1] * 2 + [1e-4] * 3 + [1e-5] * 3 + [1e-4] * 3 + [1e-5] * 3
-    )
+    scale = np.array([1.0, 1, 1, 1, 1e-3, 1e-2, 1e-4, 1e-4, 0.1] * 2 + ([1e-4] * 3 + [1e-5] * 3) * 2)
     for k in range(30):
         delta = 0.1 * scale * (np.arange(30) == k)
         ahead, behind = (
