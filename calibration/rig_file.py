@@ -8,6 +8,7 @@ import contextlib
 import io
 import json
 import os
+import secrets
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -159,7 +160,7 @@ def write_rig(path: str | os.PathLike[str], content: StereoRig | StereoCalibrati
         True
     """
     path = Path(path)
-    part = path.with_name(path.name + ".part")
+    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
     try:
         with open(part, "wb") as handle:
             handle.write(rig_bytes(content))
