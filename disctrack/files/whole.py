@@ -172,7 +172,7 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
     """Raise OutputError if `path` is an input (`refuse_input`), or exists and may not be replaced."""
     refuse_input(path)
     if path.exists() and not overwrite:
-        raise OutputError(f"{path}: exists. Choose another name or folder, or replace it with --overwrite.")
+        raise OutputError(f"{path}: exists. Choose another name or replace it: --overwrite (Python: overwrite=True).")
 
 
 def seen_from(folder: Path, path: Path) -> Path:

@@ -25,9 +25,8 @@ from disctrack.discrepancy.search import Diagnosis, Verdict
 from disctrack.discrepancy.shape import leaves_most
 from disctrack.discrepancy.significance import TWO_SIDED, whiteness
 from disctrack.discrepancy.system import Candidate, System
-from disctrack.errors import OutputError
 from disctrack.files.json_text import json_file, plain
-from disctrack.files.whole import write_whole
+from disctrack.files.whole import refuse_existing, write_whole
 from disctrack.findings import Kind, Severity, of_kind
 from disctrack.numbers import in_unit, probability, rounded
 from disctrack.report.blocks import Drawn, Figures, Listing, Report, Section
@@ -261,13 +260,12 @@ class Answer:
 
     def _errors(self, fit: Fit, held: HeldOut | None) -> dict[str, ChannelErrors]:
         names = self.system.formulas.channels
-        left = np.concatenate([s.data - seen for s, seen in self.predicted(fit)])
-        rms = np.sqrt(np.nanmean(left**2, axis=0))
+        rms = _rms(np.concatenate([s.data - seen for s, seen in self.predicted(fit)]))
         ahead = np.full(len(names), np.nan)
         if held is not None:
             free = [(s.data - seen)[~fitted_rows(s)] for s, seen in self.predicted(held.train)]
-            ahead = np.sqrt(np.nanmean(np.concatenate(free) ** 2, axis=0))
-        noise = np.sqrt(np.nanmean(np.concatenate([s.sigma**2 for s in self.system.stretches]), axis=0))
+            ahead = _rms(np.concatenate(free))
+        noise = _rms(np.concatenate([s.sigma for s in self.system.stretches]))
         if not self.autocorrelated:  # as estimated from the residuals, which contain less of the motion than the data
             noise = noise * np.sqrt(self.diagnosis.noise)
         both = zip(names, rms, ahead, noise, strict=True)
@@ -348,8 +346,7 @@ class Answer:
 
         paths = Path(folder) / "diagnosis.json", Path(folder) / "diagnosis.html"
         for path in paths:
-            if path.exists() and not overwrite:
-                raise OutputError(f"{path}: exists. Choose another folder, or say overwrite=True.")
+            refuse_existing(path, overwrite)
         write_whole(paths[0], json_file(self.document()))
         write_answer(self, paths[1])
         return paths
@@ -397,6 +394,11 @@ def free_run(system: EquationSystem, fitted: Fit, samples: Samples, left: Array,
         seen, sigma = found.seen, np.sqrt(np.maximum(variance, 0.0))
     by_channel = [dict(zip(alone.formulas.channels, each.T, strict=True)) for each in (seen, sigma)]
     return Forecast(samples.time, *by_channel)
+
+
+def _rms(values: Array) -> Array:
+    """Root mean squares (w,) of the values (n, w) that are not NaN; NaN where all are."""
+    return np.asarray(np.sqrt(np.ma.masked_invalid(values**2).mean(axis=0).filled(np.nan)), float)
 
 
 def _before_after(answer: Answer) -> Listing:
