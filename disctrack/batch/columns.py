@@ -14,7 +14,7 @@ from disctrack.recording.declaration import Recording
 
 Row = dict[str, Any]  # column -> value in JSON types, None if not known
 
-UNITS = ("m",) * 3 + ("rad",) * 3  # of COORDINATES
+UNITS = dict(zip(COORDINATES, ("m",) * 3 + ("rad",) * 3, strict=True))  # by coordinate
 
 PATHS = ("trajectory", "report", "diagnosis_report")  # columns with paths of files among a recording's results
 
@@ -49,11 +49,8 @@ COLUMNS: dict[str, str] = {
     "energy_loss_sigma_J": "noise and calibration",
     **{f"reprojection_rms_{camera}_px": "observed - projected dots" for camera in CAMERAS},
     "reduced_chi_square": "of the poses, median of the frames",
-    **{f"{n}_sigma_{u}": "noise of one frame, median" for n, u in zip(COORDINATES, UNITS, strict=True)},
-    **{
-        f"{n}_sigma_calibration_{u}": "from the rig, common to all frames"
-        for n, u in zip(COORDINATES, UNITS, strict=True)
-    },
+    **{f"{n}_sigma_{u}": "noise of one frame, median" for n, u in UNITS.items()},
+    **{f"{n}_sigma_calibration_{u}": "from the rig, common to all frames" for n, u in UNITS.items()},
     "diagnosis": "verdict, if a diagnosis was requested",
     "diagnosis_sentence": "",
     "diagnosis_p_value": "probability that noise alone produces so large a decrease of chi-square",

@@ -27,7 +27,7 @@ from disctrack.discrepancy.fit import fit
 from disctrack.errors import AnalysisError, DiscTrackError, TrackingError, reason_of
 from disctrack.files.json_text import json_sha256, plain
 from disctrack.findings import Kind, leading
-from disctrack.frames import CAMERAS, COORDINATES
+from disctrack.frames import CAMERAS
 from disctrack.recording.declaration import read_recording
 from disctrack.track.measurement import measure, open_pairs, trajectory_provenance
 from disctrack.trajectory import Trajectory
@@ -141,7 +141,7 @@ def tracked_numbers(trajectory: Trajectory) -> Row:
         seen = rms[np.isfinite(rms)]
         numbers[f"reprojection_rms_{camera}_px"] = np.sqrt(np.mean(seen**2)) if seen.size else None
     for ending, sigma in (("", trajectory.coordinate_sigma), ("_calibration", trajectory.calibration_sigma)):
-        for name, unit, of_frames in zip(COORDINATES, UNITS, sigma.T, strict=True):
+        for (name, unit), of_frames in zip(UNITS.items(), sigma.T, strict=True):
             numbers[f"{name}_sigma{ending}_{unit}"] = _median(of_frames)
     return numbers
 
