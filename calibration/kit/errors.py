@@ -34,11 +34,14 @@ class RigFileError(DiscTrackError):
 
 @contextmanager
 def told_as(error: type[DiscTrackError], said: str, *kinds: type[Exception], then: str = "") -> Iterator[None]:
-    """Convert exceptions of these kinds, mostly of libraries, into an error of ours: `said`, reason, `then`."""
+    """Convert exceptions of these kinds, mostly of libraries, into an error of ours: `said`, reason, `then`.
+
+    Errors of ours are converted only if their own class is given.
+    """
     try:
         yield
-    except DiscTrackError:
-        raise
     except kinds as reason:
+        if isinstance(reason, DiscTrackError) and type(reason) not in kinds:
+            raise
         why = getattr(reason, "strerror", "") or " ".join(str(reason).split()) or type(reason).__name__
         raise error(f"{said}: {why.removesuffix('.')}.{f' {then}' if then else ''}") from reason

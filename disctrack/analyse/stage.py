@@ -15,7 +15,7 @@ from disctrack.analyse.derivatives import CHANNELS, N_STATE, STATE, MeasuredMoti
 from disctrack.analyse.power_laws import WINDOW
 from disctrack.analyse.quantities import QUANTITIES, DerivedSeries, Propagated
 from disctrack.analyse.report import report_of
-from disctrack.errors import AnalysisError
+from disctrack.errors import AnalysisError, told_as
 from disctrack.files.labelled_arrays import Variable
 from disctrack.files.whole import keep, refuse_existing
 from disctrack.frames import euler_jacobian
@@ -68,10 +68,8 @@ def run_analyse(
     folder = Path(output) if output is not None else path.parent / f"{path.stem}_analysis"
     refuse_existing(folder / "report.html", overwrite)
     trajectory, provenance = read_trajectory(path), read_provenance(path)
-    try:
+    with told_as(AnalysisError, str(path), AnalysisError):
         analysis = analyse(trajectory, window, circle_duration)
-    except AnalysisError as error:
-        raise AnalysisError(f"{path}: {error}") from error
     write_analysis(path, analysis)
     page = folder / "report.html"
     summary = report_of(analysis, provenance, all_figures(analysis), page, path)

@@ -28,7 +28,7 @@ from disctrack.discrepancy.score import Linearisation, score_all
 from disctrack.discrepancy.search import Diagnosis, Found, Settings
 from disctrack.discrepancy.significance import wald
 from disctrack.discrepancy.system import USED_UP
-from disctrack.errors import AnalysisError
+from disctrack.errors import AnalysisError, told_as
 from disctrack.files.json_text import json_file
 from disctrack.files.whole import keep, refuse_existing, refuse_input, write_whole
 from disctrack.report.blocks import Report
@@ -208,10 +208,8 @@ def run_diagnose(
     refuse_existing(report, overwrite)
     refuse_input(toml)
     recorded, origin = read_recorded(path), origin_of(path, {"model": content_of(model), "plan": settle})
-    try:
+    with told_as(AnalysisError, str(path), AnalysisError):
         result = diagnose(recorded.trajectory, model)
-    except AnalysisError as error:
-        raise AnalysisError(f"{path}: {error}") from error
     result = with_plan(result) if settle else result
     more = supplement(result) if result.before is not None else None
     document = {"recording": recorded.name, **as_json(result, more)}

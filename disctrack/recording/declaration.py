@@ -354,13 +354,11 @@ def _refuse_mixed_calibration(file: Path, calibration: Mapping[str, Any]) -> Non
 def _target(file: Path, calibration: Mapping[str, Any]) -> Target:
     """The target as declared. Raises RecordingError."""
     square = calibration["square_mm"] * 1e-3
-    try:
+    with told_as(RecordingError, f"{file}: [calibration]", CalibrationError):
         if "inner_corners" in calibration:
             return Board(tuple(calibration["inner_corners"]), square)
         marker = calibration["marker_mm"] * 1e-3
         return CharucoBoard(tuple(calibration["squares"]), square, marker, calibration["dictionary"])
-    except CalibrationError as error:
-        raise RecordingError(f"{file}: [calibration] {error}") from error
 
 
 def _tolerances(calibration: Mapping[str, float], table: Mapping[str, float]) -> BoardTolerances:
