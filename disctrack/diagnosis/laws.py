@@ -15,7 +15,7 @@ from disctrack.diagnosis.disc_system import DiscSystem
 from disctrack.diagnosis.errors import ResidualTests, residual_tests
 from disctrack.diagnosis.law_library import Family, LearnedLaw, differ_from_zero
 from disctrack.diagnosis.missing_force import Gain, law_of, scan
-from disctrack.discrepancy.fit import TRIAL, Fit, attempt
+from disctrack.discrepancy.fit import TRIAL, Fit, attempt, settled
 from disctrack.discrepancy.search import CLASS_GAIN, FAR, Diagnosis, Explanation, Found, equivalent, length, noise_gain
 from disctrack.discrepancy.shape import leaves_most
 from disctrack.discrepancy.significance import SURE, bic_penalty
@@ -238,7 +238,8 @@ def explained_by_law(system: DiscSystem, diagnosis: Diagnosis, left: ResidualTes
         return None, replace(listed, remarks=(*diagnosis.remarks, text)) if chi_square <= at_noise else diagnosis
     if chi_square > FAR * noise:
         return None, diagnosis
-    return replace(best, law=replace(best.law, others=_others(best, answers, diagnosis))), listed
+    exact = settled(judged_as(diagnosis, system.knowing(best.law)), best.fit)
+    return replace(best, fit=exact, law=replace(best.law, others=_others(best, answers, diagnosis))), listed
 
 
 def _is_known(diagnosis: Diagnosis, by_law: Fit) -> bool:

@@ -13,7 +13,8 @@ from disctrack.discrepancy.system import GivenUp, Quantity, System, Values
 
 MAX_ITERATIONS = 40
 TRIAL = 15  # iterations of a trial: an explanation that fits the data has converged by then
-TOLERANCE = 1e-3  # converged when a full step promises a smaller decrease of chi-square, over chi-square per datum
+TOLERANCE, ROUGHLY = 1e-3, 0.1  # of the answer; of a trial, as 10 are needed to tell two explanations apart
+HOPELESS = 1e-2  # share of what a fit lacks, below which its next step promises too little
 _HALVINGS = 8
 
 
@@ -91,34 +92,49 @@ class Fit(Brief):
         return np.array([found[n] for n in self.names])
 
 
-def fit(system: System, quantities: Sequence[Quantity], start: Values, max_iterations: int = MAX_ITERATIONS) -> Fit:
+def fit(
+    system: System, quantities: Sequence[Quantity], start: Values, max_iterations: int = MAX_ITERATIONS,
+    tolerance: float = TOLERANCE, wanted: float = np.inf,
+) -> Fit:  # fmt: skip
     """Minimise chi-square over `quantities` from `start`; all other values of `start` are held.
 
     A step is halved where it increases chi-square or leads to where there is no prediction. `converged` is False where
     that does not help, or after the last iteration.
+
+    tolerance : decrease of chi-square promised by a full step, over chi-square per datum, at which it has converged
+    wanted : cost without which the fit is of no use: it is given up where a step promises little of what is lacking
     """
     problem = _Problem(system, quantities, start)
     converged, iteration = False, 0
     while np.isfinite(problem.cost) and iteration < max_iterations:
         iteration += 1
         step = problem.solve()
-        if problem.expected < TOLERANCE * max(1.0, problem.cost / problem.n_data):
+        if problem.expected < tolerance * max(1.0, problem.cost / problem.n_data):
             converged = True
             break
-        if not problem.go(step):
+        if problem.expected < HOPELESS * (problem.cost - wanted) or not problem.go(step):
             # at the rounding errors of the prediction no step decreases chi-square, and the next one promises little
             converged = bool(problem.expected < max(0.1, 1e-7 * problem.cost))
             break
     return problem.fit(converged, iteration)
 
 
-def attempt(system: System, quantities: Sequence[Quantity], start: Values, max_iterations: int = MAX_ITERATIONS) -> Fit:
+def attempt(
+    system: System, quantities: Sequence[Quantity], start: Values, max_iterations: int = MAX_ITERATIONS,
+    wanted: float = np.inf,
+) -> Fit:  # fmt: skip
     """The fit of one hypothesis among many; `no_fit` where it takes more work than such a trial may."""
     try:
         with system.budget.trial(system.trial_work):
-            return fit(system, quantities, start, max_iterations)
+            return fit(system, quantities, start, max_iterations, ROUGHLY, wanted)
     except GivenUp:
         return no_fit(quantities, start)
+
+
+def settled(system: System, trial: Fit) -> Fit:
+    """The fit of a trial, which ends roughly, continued to its end; unchanged where that is not reached or better."""
+    found = fit(system, trial.quantities, trial.values)
+    return found if found.converged and found.cost < trial.cost else trial
 
 
 class _Problem:

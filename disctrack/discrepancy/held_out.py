@@ -8,7 +8,7 @@ import numpy as np
 from calibration.kit.least_squares import OwnNumbers, triangle
 from calibration.kit.types import Array, Mask
 from disctrack.discrepancy.elimination import Own
-from disctrack.discrepancy.fit import Fit, fit
+from disctrack.discrepancy.fit import ROUGHLY, Fit, fit
 from disctrack.discrepancy.score import INVISIBLE, cleared, span
 from disctrack.discrepancy.system import Quantity, System, Values, subset
 
@@ -50,7 +50,7 @@ def held_out(system: System, quantities: Sequence[Quantity], start: Values, rows
     that quantities which the first part does not determine are not penalised. Own quantities of a block that is held
     out as a whole (a run's initial state) are projected out: what they cannot absorb is judged.
     """
-    train = fit(subset(system, rows), quantities, start)
+    train = fit(subset(system, rows), quantities, start, tolerance=ROUGHLY)
     test = ~rows & (system.weights > 0)
     own = Own(system, train.quantities)
     kept = [b for b in own.blocks if test[b.rows].any() and not (rows & (system.weights > 0))[b.rows].any()]

@@ -18,7 +18,7 @@ from scipy import stats
 
 from calibration.kit.brief import Brief
 from calibration.kit.types import Mask
-from disctrack.discrepancy.fit import Fit, attempt, fit
+from disctrack.discrepancy.fit import Fit, attempt, fit, settled
 from disctrack.discrepancy.held_out import HeldOut, held_out, training_rows
 from disctrack.discrepancy.noise import THIRD, inflation, noise_variance, whitened
 from disctrack.discrepancy.score import Linearisation, Score, angle, score_all
@@ -261,6 +261,7 @@ class _Search:
         best, alternatives = self._selected()
         if self.system.frees_shapes and first is self.base_model and self._add_free_shapes(best):
             best, alternatives = self._selected()
+        best = replace(best, fit=settled(self.system, best.fit))
         after = self.base_model if alternatives is None else best
         pairs = () if alternatives is None else zip(best.candidates, alternatives, strict=True)
         found = tuple(self._found(best, *pair) for pair in pairs)
@@ -430,14 +431,17 @@ class _Search:
         if len(extra) == 1:
             self.first.setdefault(extra[0].name, (gain, fitted))
 
-    def _explanation(
-        self, together: tuple[Candidate, ...], start: Values, tested: Sequence[Candidate] = ()
-    ) -> Explanation:
-        """By these effects, fitted from `start` if they were not before.   tested : effects that must be plausible"""
-        names = _names(together)
+    def _explanation(self, of: tuple[Candidate, ...], start: Values, rival: Explanation | None = None) -> Explanation:
+        """By these effects, fitted from `start` if they were not before.
+
+        rival : effects that it lacks have to be plausible, and the fit is given up where it cannot become as short
+        """
+        names = _names(of)
         if names not in self.pool:
-            fitted = self._fit(together, start)
-            new = Explanation(together, fitted, self._has_ended(self.base_model.fit, fitted))
+            gain = self.noise * (CLASS_GAIN + self._price(rival.candidates)) if rival else np.inf
+            fitted = self._fit(of, start, wanted=rival.fit.cost + gain if rival else np.inf)
+            new = Explanation(of, fitted, self._has_ended(self.base_model.fit, fitted))
+            tested = [c for c in of if c not in rival.candidates] if rival else []
             self.pool[names] = replace(new, plausible=False) if tested and self._is_implausible(new, tested) else new
         return self.pool[names]
 
@@ -447,7 +451,7 @@ class _Search:
         return fitted.converged or (self.system.several_minima and fitted.promised < ROUGH * gain)
 
     def _refit_without(self, e: Explanation, c: Candidate) -> Explanation:
-        return self._explanation(*_without(e, c))
+        return self._explanation(*_without(e, c), e)
 
     def _enlarged(self, e: Explanation, with_thresholds: bool) -> list[tuple[Candidate, ...]]:
         """Further effects, and pairs of them where one is not enough, with which `e` is worth a refit."""
@@ -532,13 +536,17 @@ class _Search:
             self.predictions[fit_] = held_out(self.system, fit_.quantities, fit_.values, self.rows)
         return self.predictions[fit_]
 
-    def _fit(self, candidates: Sequence[Candidate], start: Values, patient: bool = False) -> Fit:
-        """With these effects.   patient : without a limit of steps, beyond which a trial has not converged"""
-        key = _names(candidates)
+    def _fit(self, of: Sequence[Candidate], start: Values, patient: bool = False, wanted: float = np.inf) -> Fit:
+        """With these effects.
+
+        patient : without a limit of steps, beyond which a trial has not converged
+        wanted : cost without which the fit is of no use
+        """
+        key = _names(of)
         known = self.pool[key].fit if key in self.pool else None
         if known is not None and (known.converged or not key):
             return known
-        return (fit if patient else attempt)(self.system, self._quantities(candidates), start)
+        return (fit if patient else attempt)(self.system, self._quantities(of), start, wanted=wanted)
 
     def _best_fit(self, current: Explanation, extra: Sequence[Candidate]) -> Fit | None:
         """Refit with the extra candidates; None where one with a threshold has no start."""
@@ -609,8 +617,7 @@ class _Search:
             smaller = self._refit_without(e, c)
             loss = (smaller.fit.cost - e.fit.cost) / self.noise
             enough = noise_gain(self.system, e.fit, self.noise, c, self.threshold(len(c.names)))
-            if smaller.fit.converged or loss < enough:  # a fit that has not converged loses even less further on
-                losses.append((loss / enough, c.name, smaller))
+            losses.append((loss / enough, c.name, smaller))
         least, _, smaller = min(losses, default=(np.inf, "", e))
         return smaller if least < 1.0 else None
 
@@ -632,7 +639,7 @@ class _Search:
         near = near[: MOST_ALTERNATIVES if strength < FAINT else MOST_ALTERNATIVES // 2]
         found = []
         for candidate in near:
-            other = self._explanation((*rest, candidate), start, (candidate,))
+            other = self._explanation((*rest, candidate), start, e)
             loss = (other.fit.cost - e.fit.cost) / self.noise
             if other.fit.converged and loss < CLASS_GAIN:
                 found.append(Alternative(candidate, angles[candidate.name], loss, other.fit))

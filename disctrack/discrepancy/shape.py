@@ -78,8 +78,7 @@ def _size(q: Quantity, value: float) -> float:
 def is_determined(fitted: Fit, q: Quantity) -> bool:
     """Is this shape parameter known better than its order of magnitude?"""
     value, sigma = fitted.values[q.name], fitted.sigma(q.name)
-    inside = q.lower < value < q.upper
-    return inside and 0 < sigma < DETERMINED * _size(q, value)
+    return q.lower < value < q.upper and 0 < sigma < DETERMINED * _size(q, value)
 
 
 def expected_sigma(system: System, after: Fit, q: Quantity) -> float:
