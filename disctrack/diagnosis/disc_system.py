@@ -35,10 +35,12 @@ ROLLS = 0.2  # of that in one motion that cannot slip: for laws of vanishing wid
 MOST_WORK = 12_000  # per frame: steps of the integrator and rows of derivatives, 5 to 10 us each; some laws take half
 USUAL = 700  # frames, below which a recording may take as much work as with so many
 MOST_SIGMAS = 10.0  # of a size's tolerance, which bound its fit: it must not compensate for a wrong clock
+REMEMBERED = 8  # points of fits to so many frames: a trial begins where others do, and ends where it is looked at again
 SLIP_STARTS = (0.9, 0.7, 0.5)  # initial guesses of mu over the largest friction that rolling needs
 
 
 Path = tuple[Array, Array]  # q and qdot of the disc at the instants of each camera, both (2, n, 6)
+Point = tuple[Sight, dict[str, Array]]  # at one point of a fit: the dots, and derivatives (n, 4 m) that were computed
 
 
 class DiscSystem(System):
@@ -99,6 +101,9 @@ class DiscSystem(System):
         nuisances, self._nuisance_columns = self._nuisances()
         self._nuisance_column = {q.name: i for i, q in enumerate(nuisances)}
         self.base = (*fitted, *sizes, *nuisances)
+        self._absent = {q.name: q.null for c in self.candidates for q in c.quantities}
+        self._points: dict[frozenset[tuple[str, float]], Point] = {}
+        self.remembers = max(2, REMEMBERED * USUAL // max(len(self.time), 1))  # points
 
     def _sizes(self, fitted: Set[str]) -> Iterator[Quantity]:
         """Errors of the disc's sizes and of the table, with their tolerances as priors; an effect exceeds these.
@@ -177,10 +182,10 @@ class DiscSystem(System):
 
         known : faults with which the poses were fitted
         """
-        view, delay = copy(self), scene_faults(self.disc, known).right_delay_s
-        view.measured, met = self._as_measured(delay), self.time + delay  # by the right camera
-        view.weights = np.where((met >= self.time[0]) & (met <= self.time[-1]), self.weights, 0.0)
-        return view
+        delay = scene_faults(self.disc, known).right_delay_s
+        met = self.time + delay  # by the right camera
+        weights = np.where((met >= self.time[0]) & (met <= self.time[-1]), self.weights, 0.0)
+        return self._with(measured=self._as_measured(delay), weights=weights)
 
     def start(self) -> dict[str, float]:
         """Initial guess of the base quantities from the measured poses, with the known faults."""
@@ -201,11 +206,9 @@ class DiscSystem(System):
         for stretch in STRETCHES:
             n = int(np.searchsorted(self.time, self.time[0] + stretch, side="right"))
             if n < len(self.time):
-                part = copy(self)
-                part.rows = slice(self.rows.start, self.rows.start + n)
-                for name in ("time", "used", "observed", "_whiten", "weights", "_nuisance_columns"):
-                    setattr(part, name, getattr(self, name)[:n])
-                yield part
+                cut = ("time", "used", "observed", "_whiten", "weights", "_nuisance_columns")
+                rows = slice(self.rows.start, self.rows.start + n)
+                yield self._with(rows=rows, **{name: getattr(self, name)[:n] for name in cut})
 
     @property
     def per_px(self) -> float:
@@ -219,9 +222,13 @@ class DiscSystem(System):
 
     def knowing(self, law: LearnedLaw) -> "DiscSystem":
         """The same system with this law in its model: its coefficients may be among the values."""
-        known = copy(self)
-        known.model = self.model.knowing(law.effect)
-        return known
+        return self._with(model=self.model.knowing(law.effect))
+
+    def _with(self, **changed: object) -> "DiscSystem":
+        """A copy with other attributes, which remembers nothing."""
+        other = copy(self)
+        other.__dict__ |= changed | {"_points": {}}
+        return other
 
     def model_with(self, values: Values) -> Model:
         """The model with every effect that has an amount in `values`."""
@@ -248,26 +255,41 @@ class DiscSystem(System):
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened dots (n, 4 m), observed minus predicted, and the prediction's derivative (n, 4 m, k)."""
-        self.budget.work(len(names) * len(self.time))
-        path, moved, by_motion = self._path(values, names)
-        sight = self._sight(path, values)
-        residual = self._residual(sight.pixels, values)
-        derivative = np.zeros((*residual.shape, len(names)))
-        column = {name: i for i, name in enumerate(names)}
-        if moved:
-            derivative[..., [column[n] for n in moved]] = self.whitened(sight.by_pose) @ by_motion
-        common = [n for n in names if n in self._nuisance_column]
-        mine = self._nuisance_columns[..., [self._nuisance_column[n] for n in common]]
-        derivative[..., [column[n] for n in common]] = mine
+        sight, columns = self._point(values)
+        if new := [n for n in names if n not in columns]:
+            self.budget.work(len(new) * len(self.time))
+            columns |= self._columns(sight, values, new)
+        derivative = np.zeros((len(self.time), 2 * self.used[0].size, len(names)))
+        for i, name in enumerate(names):
+            derivative[..., i] = columns[name]
+        return self._residual(sight.pixels, values), derivative
+
+    def _columns(self, sight: Sight, values: Values, names: Sequence[str]) -> dict[str, Array]:
+        """Derivatives (n, 4 m) by these names; zero for those that move nothing."""
+        found = dict.fromkeys(names, np.zeros((len(self.time), 2 * self.used[0].size)))
+        _, moved, by_motion = self._path(values, names)
+        found |= zip(moved, np.moveaxis(self.whitened(sight.by_pose) @ by_motion, -1, 0), strict=True)
         for fault in self.faults:
             for name, part in zip(fault.names(), fault.parts, strict=True):
-                if name in column:
-                    derivative[..., column[name]] = self.whitened(fault.column(part, sight)[..., None])[..., 0]
-        return residual, derivative
+                if name in found:
+                    found[name] = self.whitened(fault.column(part, sight)[..., None])[..., 0]
+        return found
+
+    def _point(self, values: Values) -> Point:
+        """What is known at these values; nuisances, and effects that are absent, do not matter."""
+        key = {n: v for n, v in values.items() if n not in self._nuisance_column and v != self._absent.get(n)}.items()
+        known = self._points.pop(frozenset(key), None)
+        if known is None:
+            nuisances = zip(self._nuisance_column, np.moveaxis(self._nuisance_columns, -1, 0), strict=True)
+            known = self._sight(self._path(values)[0], values), dict(nuisances)
+        self._points[frozenset(key)] = known  # the last one
+        if len(self._points) > self.remembers:
+            del self._points[next(iter(self._points))]
+        return known
 
     def pixels(self, values: Values) -> Array:
         """Predicted images of the dots (n, 2, m, 2) [px], without the nuisances."""
-        return self._sight(self._path(values)[0], values).pixels
+        return self._point(values)[0].pixels
 
     def residual_px(self, values: Values) -> Array:
         """Residuals of the images of the dots (n, 2, m, 2) [px]; zero where a dot is not used."""
@@ -319,7 +341,7 @@ class DiscSystem(System):
 
     def pose_equations(self, values: Values) -> tuple[Array, Array, Array]:
         """Residual (n, 4 m), its derivative (n, 4 m, 6) and normal matrix (n, 6, 6) by a free pose per frame."""
-        sight = self._sight(self._path(values)[0], values)
+        sight, _ = self._point(values)
         r = self._residual(sight.pixels, values)
         J = self.whitened(sight.by_pose)
         normal = np.swapaxes(J, 1, 2) @ J

@@ -117,6 +117,7 @@ class DiscMember:
     def with_common(self, systematic: Systematic) -> Member:
         """The member, fitted alone with systematic errors that it shares with others. Raises AnalysisError."""
         self.system = system = self.system.again(systematic=systematic)
+        system.remembers = 1  # there may be a hundred recordings
         self.base = fit(system, system.base, system.start())
         if not self.base.converged:
             raise AnalysisError(
@@ -170,15 +171,6 @@ def in_common(members: Sequence[tuple[Mapping[str, str], Systematic, list[Array]
         dots = max((s for s, _ in rigs), key=lambda s: s.dot_px)
         places = tuple(np.concatenate([p[c] for _, p in rigs]) for c in range(2))
         print_m = max(s.print_m for of, s, _ in members if of["disc"] == labels["disc"])
-        common.append(
-            replace(
-                mine,
-                lens_px=lens.lens_px,
-                lens_length_px=lens.lens_length_px,
-                lens_places=places,
-                dot_px=dots.dot_px,
-                dot_length_px=dots.dot_length_px,
-                print_m=print_m,
-            )
-        )
+        of_rig = replace(mine, lens_px=lens.lens_px, lens_length_px=lens.lens_length_px, lens_places=places)
+        common.append(replace(of_rig, dot_px=dots.dot_px, dot_length_px=dots.dot_length_px, print_m=print_m))
     return common
