@@ -143,8 +143,7 @@ class ResidualTests:
     @property
     def of_the_measurement(self) -> bool:
         """Are the residuals larger than noise, but alike in all components, and not so large that they hide effects?"""
-        excess = self.other_chi_square - 1.0
-        return 0.05 < excess < MUCH and self.alike
+        return 0.05 < self.other_chi_square - 1.0 < MUCH and self.alike
 
 
 def residual_tests(system: DiscSystem, fit_: Fit, noise: float) -> ResidualTests:

@@ -49,17 +49,10 @@ def slip_start(model: Model) -> Candidate:
 def effect_quantity(effect: type[Effect], parameter: EffectParameter) -> Quantity:
     """A parameter of an effect as a quantity of a fit."""
     p, size = parameter, abs(parameter.nominal)
-    return Quantity(
-        f"{effect.name}.{p.name}",
-        p.unit,
-        0.01 * size,
-        p.nominal if p.is_shape else p.null,
-        p.lower,
-        p.upper,
-        meaning=p.meaning,
-        typical=size or np.inf,  # a position may be anywhere
-        belongs_to=effect.belongs_to,
-    )
+    null = p.nominal if p.is_shape else p.null
+    one = Quantity(f"{effect.name}.{p.name}", p.unit, 0.01 * size, null, p.lower, p.upper, meaning=p.meaning)
+    # a position may be anywhere
+    return replace(one, typical=size or np.inf, belongs_to=effect.belongs_to)
 
 
 def model_quantities(model: Model) -> tuple[Quantity, ...]:

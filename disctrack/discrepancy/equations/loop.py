@@ -199,8 +199,7 @@ def _with_guesses(system: EquationSystem, values: Mapping[str, float]) -> Equati
     for along in np.nanquantile(np.concatenate(passed, axis=1), shares, axis=1):
         bounds = [(f.declared[name].lower, f.declared[name].upper) for name in f.along]
         tried = dict(zip(f.along, np.clip(along, *np.transpose(bounds)).tolist(), strict=True))
-        there = replace(system, guesses=tried)
-        linear = Linearisation(there, here, amounts)
+        linear = Linearisation(replace(system, guesses=tried), here, amounts)
         for c in amounts if linear.usable else ():
             gain, _ = linear.gain_of(c.names)
             if gain > best.get(c.name, (0.0, {}))[0]:

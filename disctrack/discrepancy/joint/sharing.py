@@ -209,8 +209,7 @@ class JointSystem(System):
     def __init__(self, sharing: Sharing, crew: Crew) -> None:
         """Crew : of the members of the sharing, each with the methods `share` and `reduce` (`Reduction`)."""
         self.sharing, self._crew = sharing, crew
-        n = len(sharing.members)
-        self.time: Array = np.arange(n, dtype=float)
+        self.time: Array = np.arange(len(sharing.members), dtype=float)
         own = [sharing.own(i, m.base) for i, m in enumerate(sharing.members)]
         crew.call("share", [(quantities,) for quantities in own])
         free = [sum(not np.isfinite(q.prior_sigma) for q in quantities) for quantities in own]

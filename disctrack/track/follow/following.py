@@ -202,8 +202,7 @@ def _resumed(follower: Follower, heading: Heading, images: Image, readable: Mask
 
 def _enough(status: Codes) -> bool:
     """True if a pose with dots of this status (2, m) cannot be due to chance."""
-    found = int(np.sum(status == MarkerStatus.MEASURED))
-    return found >= min(MIN_TO_BEGIN, status.shape[-1])
+    return int(np.sum(status == MarkerStatus.MEASURED)) >= min(MIN_TO_BEGIN, status.shape[-1])
 
 
 def _go_back(follower: Follower, images: Image, readable: Mask, rows: Tables, found: int) -> None:

@@ -96,8 +96,7 @@ def test_slip_at_the_start_is_found_with_its_friction_and_its_end():
 @pytest.mark.parametrize("n", [300, pytest.param(900, marks=pytest.mark.slow)])
 def test_slip_of_a_millimetre_per_second_at_the_first_frame_is_found(n):
     """Friction below what rolling needs: no velocity shows the slip; 900 frames slip seven times, within a trial."""
-    trajectory = measured({"slip.mu": 0.06}, seed=100, n=n, theta_deg=20.0)
-    result = diagnose(trajectory)
+    result = diagnose(measured({"slip.mu": 0.06}, seed=100, n=n, theta_deg=20.0))
     assert result.system.budget.open(kept=0.5)  # not half of the work is needed
     assert [f.candidate.name for f in result.diagnosis.found] == ["slip_start"]
     assert result.after.reduced_chi_square < 1.03 < 1000 < result.before.reduced_chi_square
@@ -107,8 +106,7 @@ def test_slip_of_a_millimetre_per_second_at_the_first_frame_is_found(n):
 @pytest.mark.statistical
 @pytest.mark.parametrize("effects", [{"table_tilt.tilt_x": 5e-3}, {"kz.k_z": 3e-4}, {"slip.mu": 0.1}])
 def test_what_rolls_at_first_does_not_begin_in_slip(effects):
-    trajectory = measured(effects, seed=100, n=150, theta_deg=20.0)
-    system = DiscSystem(trajectory, PAPER)
+    system = DiscSystem(measured(effects, seed=100, n=150, theta_deg=20.0), PAPER)
     assert fit(system, system.base, system.start()).reduced_chi_square > FAR
     assert not motion_search._slips_slowly(Settings(), system)
 

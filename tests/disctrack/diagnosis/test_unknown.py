@@ -66,8 +66,7 @@ def test_missing_moment_is_the_hidden_one():
 
 @pytest.mark.statistical
 def test_in_noise_no_law_is_learned():
-    trajectory = measured(seed=8, n=300)
-    system, base = with_base_fit(trajectory)
+    system, base = with_base_fit(measured(seed=8, n=300))
     assert learn(system, base, 1.0) is None
 
 
@@ -116,8 +115,7 @@ def test_a_law_is_looked_for_along_the_motion_that_follows_the_data():
 
     The motion is the oracle's, with 40 N/m^2.
     """
-    trajectory = recording("quadratic_spring").trajectory
-    system, base = with_base_fit(trajectory)
+    system, base = with_base_fit(recording("quadratic_spring").trajectory)
     spring = next(c for c in system.candidates if c.name == "spring")
     along = fit(system, (*base.quantities, *spring.quantities), base.values)
     assert along.reduced_chi_square < 0.01 * base.reduced_chi_square
@@ -440,8 +438,7 @@ def test_a_known_effect_that_stands_in_with_a_law_is_not_claimed(name, beside):
 )
 def test_an_uneven_table_moves_the_disc_as_the_work_of_the_load_does(name, kind, shape, amount):
     """The oracle lets the load pay for what the contact climbs, for every direction of the angular velocity."""
-    unknown = replace(UNKNOWN[name], duration=0.2)
-    times, course, _ = motion(unknown)
+    times, course, _ = motion(replace(UNKNOWN[name], duration=0.2))
     q, speed = course(times), course(times[0], 1)
     family = next(f for f in families(q, times, 500.0, DISC) if f.kind == kind)
     formulas = replace(family, shape=shape).formulas()[0]

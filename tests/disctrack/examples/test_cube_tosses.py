@@ -56,8 +56,7 @@ def named(diagnosis):
     ids=["nothing", "scale and centre of mass", "inertia", "a vertical that leans with every toss"],
 )
 def test_what_is_hidden_in_simulated_tosses_is_named_and_sized(rng, tmp_path, hidden, expected):
-    system = system_of(simulated(rng, tmp_path, **hidden))
-    found = cube_tosses.diagnosed(system)
+    found = cube_tosses.diagnosed(system_of(simulated(rng, tmp_path, **hidden)))
     assert named(found) == {key.partition(".")[0] for key in expected}
     assert found.verdict == ("found" if expected else "nothing missing")
     for key, value in expected.items():
@@ -67,8 +66,7 @@ def test_what_is_hidden_in_simulated_tosses_is_named_and_sized(rng, tmp_path, hi
 
 @pytest.mark.statistical
 def test_gravity_and_frame_rate_are_one_number_where_cubes_at_rest_deny_the_scale(rng, tmp_path):
-    system = system_of(simulated(rng, tmp_path, gravity=9.7))
-    found = cube_tosses.diagnosed(system)
+    found = cube_tosses.diagnosed(system_of(simulated(rng, tmp_path, gravity=9.7)))
     (effect,) = found.found
     alternatives = {r.candidate.name for r in effect.cannot_be_told_from}
     assert {effect.candidate.name} | alternatives == {"gravity", "frame_rate"}

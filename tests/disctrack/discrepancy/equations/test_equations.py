@@ -750,8 +750,7 @@ def test_a_motion_that_runs_away_is_given_up_early():
     """Negative friction winds a pendulum up: it takes more steps than any motion of so few samples."""
     time = 0.02 * np.arange(110)
     rod = Equations({"th": "w", "w": "-k*sin(th) - c*w"}, {"k": 8.0, "c": 2.0})
-    run = Run(time, {"th": np.cos(time)}, 1.0)
-    system, _ = system_of(rod, run)
+    system, _ = system_of(rod, Run(time, {"th": np.cos(time)}, 1.0))
     begin = {"state.th[run1]": 0.5, "state.w[run1]": 0.0}
     assert np.isfinite(system.linearise(begin, [])[0]).all()
     began = clock.process_time()

@@ -23,8 +23,7 @@ from tests.oracles.decaying_runs import DISC, DecayMember, fitted_at_once, one, 
 
 def joint(items, processes=1):
     crew = Crew(DecayMember, items, processes)
-    sharing = Sharing([DecayMember(item).member for item in items])
-    return JointSystem(sharing, crew), crew
+    return JointSystem(Sharing([DecayMember(item).member for item in items]), crew), crew
 
 
 def answer(items):
