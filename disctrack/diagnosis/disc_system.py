@@ -99,7 +99,7 @@ class DiscSystem(System):
         in_base = {q.name for q in (*of_slip, *(q for q in sizes if not q.belongs_to))}
         self.candidates = tuple(c for c in candidates if not in_base & set(c.names))
         nuisances, self._nuisance_columns = self._nuisances()
-        self._nuisance_column = {q.name: i for i, q in enumerate(nuisances)}
+        self._nuisance_names = dict.fromkeys(q.name for q in nuisances)
         self.base = (*fitted, *sizes, *nuisances)
         self._absent = {q.name: q.null for c in self.candidates for q in c.quantities}
         self._points: dict[frozenset[tuple[str, float]], Point] = {}
@@ -255,10 +255,12 @@ class DiscSystem(System):
 
     def linearise(self, values: Values, names: Sequence[str]) -> tuple[Array, Array]:
         """Whitened dots (n, 4 m), observed minus predicted, and the prediction's derivative (n, 4 m, k)."""
-        sight, columns = self._point(values)
-        if new := [n for n in names if n not in columns]:
-            self.budget.work(len(new) * len(self.time))
-            columns |= self._columns(sight, values, new)
+        sight, known = self._point(values)
+        new = [n for n in names if n not in known]
+        self.budget.work(len(new) * len(self.time))
+        columns = known | (self._columns(sight, values, new) if new else {})
+        # the steps of one call may be used up before its last derivatives, which another call computes
+        known |= {n: columns[n] for n in new if np.isfinite(columns[n]).all()}
         derivative = np.zeros((len(self.time), 2 * self.used[0].size, len(names)))
         for i, name in enumerate(names):
             derivative[..., i] = columns[name]
@@ -277,12 +279,12 @@ class DiscSystem(System):
 
     def _point(self, values: Values) -> Point:
         """What is known at these values; nuisances, and effects that are absent, do not matter."""
-        key = {n: v for n, v in values.items() if n not in self._nuisance_column and v != self._absent.get(n)}.items()
-        known = self._points.pop(frozenset(key), None)
+        moved = ((n, v) for n, v in values.items() if n not in self._nuisance_names and v != self._absent.get(n))
+        known = self._points.pop(key := frozenset(moved), None)
         if known is None:
-            nuisances = zip(self._nuisance_column, np.moveaxis(self._nuisance_columns, -1, 0), strict=True)
+            nuisances = zip(self._nuisance_names, np.moveaxis(self._nuisance_columns, -1, 0), strict=True)
             known = self._sight(self._path(values)[0], values), dict(nuisances)
-        self._points[frozenset(key)] = known  # the last one
+        self._points[key] = known  # the last one
         if len(self._points) > self.remembers:
             del self._points[next(iter(self._points))]
         return known
@@ -351,7 +353,7 @@ class DiscSystem(System):
     def _residual(self, pixels: Array, values: Values) -> Array:
         """Whitened rows of observed minus predicted dots, minus the contribution of the nuisances."""
         residual = self.whitened((self.observed - pixels)[..., None])[..., 0]
-        weights = np.array([values.get(name, 0.0) for name in self._nuisance_column])
+        weights = np.array([values.get(name, 0.0) for name in self._nuisance_names])
         return residual - self._nuisance_columns @ weights if weights.any() else residual
 
     def _path(self, values: Values, names: Sequence[str] = ()) -> tuple[Path, tuple[str, ...], Array]:
