@@ -120,8 +120,7 @@ def measured(
     fits = fit_poses(seen, reject_outliers=False)
     taken = Taken(range(n), declared_rate, scene.gravity_m_s2)
     good = np.zeros(pixels.shape[:-1], np.uint8)  # status of frames and dots
-    status = status_of(good[:, 0, 0], seen, fits)
-    found = trajectory_of(seen, fits, np.zeros((n, 6, 6)), status, good, taken)
+    found = trajectory_of(seen, fits, np.zeros((n, 6, 6)), status_of(good[:, 0, 0], seen, fits), good, taken)
     # with a bent board, tracking determines the displacement of the table from the rim
     height, *tilts = (1e-3 * scene.imperfections.board_bow_mm * TABLE_BY_BOW).tolist()
     return replace(found, table_moved=(height, *tilts))
