@@ -30,7 +30,9 @@ if TYPE_CHECKING:
 
 MARGIN = 0.6  # of a field's correlation length, by which its grid exceeds the positions
 DOT_SIGMA = 3e-7  # [m] a common bias of one dot's centre in all images: 1/800 px, below what edges of dots allow
-LENS_LENGTHS = (0.3, 0.6, 0.17)  # correlation lengths of a camera's field, over the extent of the positions
+# Correlation lengths of a camera's field, over the extent of the positions. For the same bends a field of half the
+# length has half the size, and shifts or turns the whole image half as much
+LENS_LENGTHS = (0.17, 0.24, 0.35, 0.5, 0.7, 1.0)
 DOT_LENGTH = 0.5  # correlation length of the fields of single dots, likewise
 MAX_FRAMES = 200  # that are used: fields change slowly
 WORTH = 20.0  # increase of twice the log likelihood by which a fault or a field is accepted: odds of 2e4
@@ -246,7 +248,7 @@ def find_systematic(system: "DiscSystem") -> Systematic:
     grids = {"print": DOT_SIGMA * 2.0 ** np.arange(7.0), "lens": steps, "dot": steps}
     start, offered = {"rig": 1.0, "print": DOT_SIGMA}, {name: typical[name] for name in faults}
     found, most = Systematic(), -np.inf
-    for share in (0.0, *LENS_LENGTHS):  # without any field, and with fields of the cameras of these lengths
+    for share in (0.0, *LENS_LENGTHS):  # without any field, and with fields of the cameras of the likeliest length
         sought, fields = (grids, {"lens": field(share * extent)}) if share else ({}, {})
         likelihood = Likelihood(data, groups | fields)
         value, sizes = _best_sizes(likelihood, dict(start), sought)
@@ -254,7 +256,7 @@ def find_systematic(system: "DiscSystem") -> Systematic:
         chosen = [name for name in sizes if name in offered]
         if chosen:  # the faults have reduced the fields
             value, sizes = _best_sizes(likelihood, start | {name: typical[name] for name in chosen}, sought)
-        if share and value < most + WORTH:
+        if share and value < most + (0.0 if found.present else WORTH):
             continue
         _, amounts, chi_square = likelihood.at(sizes)
         moved = float(np.linalg.norm(sum(by_fault[name] @ amounts[name] for name in chosen)))

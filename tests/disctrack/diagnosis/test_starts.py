@@ -219,8 +219,7 @@ def recording(effects=None, *, laboratory=LABORATORY, faults=None, seed=1, n=300
 
 
 def systematic_of(trajectory):
-    trajectory = with_noise_of_frames(trajectory)
-    return find_systematic(system_of(trajectory))
+    return find_systematic(system_of(with_noise_of_frames(trajectory)))
 
 
 def test_the_noise_is_what_changes_from_frame_to_frame():
@@ -247,6 +246,7 @@ def test_fields_are_sized_from_the_dots_alone_and_faults_are_no_fields():
     found = systematic_of(recording()[0])
     assert found.left == pytest.approx(1.0, abs=0.1)  # 200 frames of 18 numbers: 2 %, and what bumps miss
     assert 0.008 < found.lens_px < 0.05  # 0.02 px over the whole image; the dots see a part of it
+    assert 75 < found.lens_length_px < 150  # waves of 0.4 to 1.4 periods along it: their mean square is that of 86 px
     assert found.faults_px == 0.0
     alone = systematic_of(recording(laboratory={}, faults=Faults(right_delay_s=2e-4))[0])
     assert (alone.present, alone.faults_px > 0.03) == (False, True)  # 0.2 ms, in which dots move by a tenth of a pixel
