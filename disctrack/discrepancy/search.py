@@ -10,7 +10,7 @@ better than its subsets do, and whose effects remain significant when the residu
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import combinations, repeat
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -263,8 +263,7 @@ class _Search:
             best, alternatives = self._selected()
         best = replace(best, fit=settled(self.system, best.fit))
         after = self.base_model if alternatives is None else best
-        pairs = () if alternatives is None else zip(best.candidates, alternatives, strict=True)
-        found = tuple(self._found(best, *pair) for pair in pairs)
+        found = tuple(map(self._found, repeat(best), best.candidates, alternatives or ()))
         ranked = tuple(replace(e, length=self.length(e)) for e in self._ranked())
         return Diagnosis(
             *self._verdict(after, found),
@@ -326,19 +325,18 @@ class _Search:
         """Add explanations by laws of free shape, in place of all effects or of the faintest; True if there are any.
 
         An effect whose location is unknown (a flat of the rim) has no derivative at its null, so no score proposes it.
-        It is therefore also tried in addition to effects that leave too much, and in place of the faintest of several,
-        which may imitate it: an inertia, or a pattern that is off centre. What imitates it need not predict.
+        It is therefore also tried in addition to effects that leave too much, and in place of the faintest one, which
+        may imitate it: an inertia, or a pattern that is off centre. What imitates it need not predict.
         """
         at_noise, nothing, before = self._at_noise(best.fit), self.base_model, len(self.pool)
         several = self._ranked()[0]
-        if at_noise and len(several.candidates) < 2:
-            return False
         sought = [c for c in self.system.candidates if c.sought and c.name not in best.names | several.names]
-        for e in (nothing,) if at_noise or best is nothing else (nothing, best):
+        whole = [nothing] if not at_noise or len(several.candidates) > 1 else []
+        for e in whole if at_noise or best is nothing else [nothing, best]:
             below = e.fit.cost - (1.0 - WORTH_A_SHAPE) * self.noise * e.fit.excess(self.noise)
             wanted = [c for c in self.system.candidates if c.shape] if e is nothing else sought
             self._add_with_free_shape(e, wanted, 0.0, below)
-        if at_noise:
+        if at_noise and several.candidates:
             rest = min((self._refit_without(several, c) for c in several.candidates), key=lambda e: e.fit.cost)
             gain = rest.fit.cost - several.fit.cost
             if gain <= FAINT * self.noise:
@@ -347,10 +345,10 @@ class _Search:
 
     def _add_with_free_shape(self, e: Explanation, laws: Sequence[Candidate], least: float, below: float) -> None:
         """Add the explanations with one of these laws more, its shape free, whose residuals are noise."""
+        price, budget = self.noise * bic_penalty(self.system.weights), self.system.budget
         for law in laws:
-            tried = self.system.budget.open(kept=FOR_LAWS)
-            answer = with_free_shape(self.system, e.fit, law, least, below) if tried else None
-            if answer is not None and self._at_noise(answer[1]):
+            answer = budget.open(kept=FOR_LAWS) and with_free_shape(self.system, e.fit, law, least, below, price)
+            if answer and self._at_noise(answer[1]):
                 new = Explanation((*e.candidates, answer[0]), answer[1])
                 self.pool.setdefault(new.names, new)
 

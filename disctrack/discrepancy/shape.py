@@ -22,12 +22,13 @@ def leaves_most(left: float, before: float) -> bool:
 
 
 def with_free_shape(
-    system: System, base: Fit, candidate: Candidate, least: float, below: float
+    system: System, base: Fit, candidate: Candidate, least: float, below: float, price: float
 ) -> tuple[Candidate, Fit] | None:
     """The candidate with its shape free, and the fit with it; None where the data do not determine that shape.
 
     least : first-order gain, below which an unknown location is not worth a refit
     below : cost that the fit from the best start must reach
+    price : decrease of the cost that more shape parameters than the first are worth, each
     """
     names = [q.name for q in candidate.shape]
     starts = [dict(zip(names, s, strict=True)) for s in system.starts(candidate, base.values, least)]
@@ -39,7 +40,8 @@ def with_free_shape(
     if not fitted.cost < below:
         return None
     free = [q for q in candidate.shape if np.isfinite(expected_sigma(system, fitted, q))]
-    fitted = attempt(system, (*fitted.quantities, *free), fitted.values)
+    trials = ((some, attempt(system, (*fitted.quantities, *some), fitted.values)) for some in (free[:1], free))
+    free, fitted = min(trials, key=lambda trial: trial[1].cost + price * len(trial[0]))
     if not (fitted.converged and all(is_determined(fitted, q) for q in free)):
         return None
     return replace(candidate, quantities=(*candidate.quantities, *free)), fitted

@@ -95,8 +95,7 @@ def test_images_of_a_faulty_scene_are_those_that_the_diagnosis_predicts(short, e
 
 def test_a_saved_model_looks_at_the_disc_as_the_cameras_did(short, tmp_path):
     system = system_of(short)
-    values = system.start()
-    rig = rig_of(load_scene(saved(system, values, tmp_path)))
+    rig = rig_of(load_scene(saved(system, system.start(), tmp_path)))
     points = short.q[:3, None, :3] + [[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.03, 0.0]]
     # principal points 4 px off the middle and focal lengths 0.5 % apart are not in a scene
     assert np.abs(rig.project(points) - short.rig.project(points)).max() < 20

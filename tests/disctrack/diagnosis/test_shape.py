@@ -6,7 +6,7 @@ from disctrack.diagnosis import DiscSystem, diagnose
 from disctrack.diagnosis.model_file import declared_model
 from disctrack.discrepancy.fit import fit
 from disctrack.discrepancy.search import explain
-from disctrack.validate.hidden import HiddenCase, recorded
+from disctrack.validate.hidden import HiddenCase, Verdict, recorded
 from tests.oracles.measured_disc import assert_found, assert_sized, measured, system_of, with_base_fit
 
 
@@ -25,8 +25,7 @@ def test_an_exponent_is_measured_from_its_nominal_value_on():
 def test_an_exponent_that_cannot_be_seen_is_said_to_be_assumed():
     """At 14 deg and over 0.2 s the rate hardly changes: any exponent gives the same moment."""
     trajectory = measured({"rolling_power.k": 2e-4}, seed=74, n=200)
-    system = system_of(trajectory, ["rolling_power"])
-    answer = explain(system, system.start())
+    answer = explain(system := system_of(trajectory, ["rolling_power"]), system.start())
     assert [f.candidate.name for f in answer.found] == ["rolling_power"]
     assert "rolling_power.p" not in answer.after.names
     (note,) = answer.remarks
@@ -60,8 +59,7 @@ def test_a_flat_of_the_rim_beside_a_fault_of_a_camera_is_no_inertia():
     every = {c.name: c for c in DiscSystem(trajectory, model).candidates}
 
     def found(*names):
-        system = DiscSystem(trajectory, model, tuple(every[name] for name in names))
-        return explain(system, system.start())
+        return explain(system := DiscSystem(trajectory, model, tuple(every[n] for n in names)), system.start())
 
     answer = found("left_distortion", "inertia_product", "rim_flat")
     assert [f.candidate.name for f in answer.found] == ["left_distortion", "rim_flat"]
@@ -70,6 +68,14 @@ def test_a_flat_of_the_rim_beside_a_fault_of_a_camera_is_no_inertia():
     assert [f.candidate.name for f in without.found] == ["left_distortion"]
     assert "inertia_product" in without.ranked[0].names
     assert answer.after.cost < without.ranked[0].fit.cost - 30.0
+
+
+@pytest.mark.statistical
+def test_a_faint_flat_of_the_rim_is_no_tilted_table():
+    """A flat alone, which no score proposes: what stands in for it gains less."""
+    verdict = Verdict(HiddenCase({"rim_flat": 1e-5}, seed=7215))
+    assert verdict.found == ["rim_flat"]
+    assert verdict.within
 
 
 def starts(name, effects, n=150):

@@ -29,8 +29,7 @@ def independent(seed, f=0.0, axial=1.0):
     )  # fmt: skip
     theta_deg, psi, omega3 = rng.uniform([4, -3, 0], [9, 3, 2])
     motion = newton_euler.filmed_motion(body, theta_deg, omega3, 130 / RATE, RATE, psi)
-    trajectory = measured(seed=seed, n=130, motion=motion, **RIG)
-    return Recorded(f"run {seed}", trajectory)
+    return Recorded(f"run {seed}", measured(seed=seed, n=130, motion=motion, **RIG))
 
 
 @pytest.mark.slow

@@ -115,8 +115,7 @@ def test_of_a_run_that_is_kept_back_what_its_own_numbers_cannot_move_is_judged(a
     own = [q.name for q in after.quantities if q.slot and q.block == len(system.blocks) - 1]
     b = f"b[{system.stretches[-1].run}]"
     free = [i for i, name in enumerate(own) if name != b]  # this one has a prior
-    names = list(held.train.shared)
-    residual, derivative = system.linearise(held.train.values, [*own, *names])
+    residual, derivative = system.linearise(held.train.values, [*own, *held.train.shared])
     C = null_space(derivative[back, 0, free].T).T
     prior = C @ derivative[back, 0, own.index(b)]
     r, J = C @ residual[back, 0] + prior * held.train.values[b], C @ derivative[back, 0, len(own) :]

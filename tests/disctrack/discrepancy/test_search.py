@@ -253,8 +253,7 @@ def test_a_fit_that_cannot_reach_what_is_wanted_is_given_up_and_no_other(rng):
 
 
 def test_explanations_that_fit_alike_are_listed_with_their_odds(rng):
-    answer = explain(oscillator(rng, {"drift": 0.01}), START)
-    listed = dict(answer.explanations)
+    listed = dict(explain(oscillator(rng, {"drift": 0.01}), START).explanations)
     assert {("drift",), ("twin",)} <= set(listed)  # one and the same but for the sign
     assert abs(listed["drift",] - listed["twin",]) < 0.1
     assert () not in listed  # the control: that nothing is missing is no alternative
