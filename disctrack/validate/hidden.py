@@ -180,7 +180,8 @@ def _expected_significance(result: DiscDiagnosis, truths: Sequence[Values], plan
     """Significance of the weakest planted effect in the joint model, and that required for a claim, in sigmas.
 
     From the Fisher information at the truth: the decrease of chi-square is a' C^-1 a for amounts a with covariance C,
-    with all other quantities fitted. NaN without a prediction, or if the catalogue lacks an effect.
+    with all other quantities fitted; C contains the tolerances of amounts that the base model allows for. NaN without a
+    prediction, or if the catalogue lacks an effect.
     """
     system, d = result.system, result.diagnosis
     own = [candidate for truth in truths for candidate in system.candidates if set(truth) <= set(candidate.names)]
@@ -190,10 +191,11 @@ def _expected_significance(result: DiscDiagnosis, truths: Sequence[Values], plan
     joint = fit(system, tuple(quantities.values()), d.before.values | planted)
     if not np.isfinite(joint.cost):
         return np.nan, np.nan
-    found = []
+    found, tolerance = [], {q.name: q.prior_sigma for q in system.base if np.isfinite(q.prior_sigma)}
     for truth, candidate in zip(truths, own, strict=True):
+        allowed = np.diag([tolerance.get(name, 0.0) ** 2 for name in candidate.names])
         amount = np.array([truth.get(q.name, q.null) - q.null for q in candidate.quantities])
-        sigmas = np.sqrt(wald(amount, joint.amounts(candidate.names)[1]) / d.noise)
+        sigmas = np.sqrt(wald(amount, d.noise * joint.amounts(candidate.names)[1] + allowed))
         found.append((float(sigmas), float(np.sqrt(threshold(system, d.settings, len(amount))))))
     return min(found, key=lambda one: one[0] / one[1])
 

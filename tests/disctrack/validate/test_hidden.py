@@ -60,6 +60,9 @@ def test_an_effect_below_its_sigma_is_not_asked_for():
     faint = Verdict(HiddenCase({"time_offset": 1e-7}, seed=3))
     assert not faint.named
     assert not faint.can_be_told
+    # 10 um of the radius, of which the base model allows 3: ten times that stands out
+    of_radius = [Verdict(HiddenCase({"contact_radius": size}, seed=3)).can_be_told for size in (1e-5, 1e-4)]
+    assert of_radius == [False, True]
     alike = Verdict(HiddenCase({"frame_rate": 0.012, "gravity": 0.05}, seed=3))
     assert alike.gain > 1e4
     assert not alike.can_be_told
