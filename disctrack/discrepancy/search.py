@@ -698,8 +698,7 @@ def _near_enough(system: System, base: Fit) -> bool:
 def _refusal(base: Fit, settings: Settings) -> Diagnosis:
     reason = (
         f"the base fit has not converged (chi-square {base.reduced_chi_square:.3g} per degree of freedom after "
-        f"{base.n_iterations} iterations): before it has, every candidate seems to help, so "
-        "that nothing is attributed"
+        f"{base.n_iterations} iterations): before it has, every candidate seems to help, so that nothing is attributed"
     )
     return Diagnosis("unexplained", reason, (), base, base, None, None, np.nan, (), settings)
 

@@ -40,8 +40,9 @@ def with_free_shape(
     if not fitted.cost < below:
         return None
     free = [q for q in candidate.shape if np.isfinite(expected_sigma(system, fitted, q))]
-    trials = ((some, attempt(system, (*fitted.quantities, *some), fitted.values)) for some in (free[:1], free))
-    free, fitted = min(trials, key=lambda trial: trial[1].cost + price * len(trial[0]))
+    several = (free[:1], free)[: max(len(free), 1)]  # the same twice where there is one
+    trials = [(attempt(system, (*fitted.quantities, *some), fitted.values), some) for some in several]
+    fitted, free = min(trials, key=lambda trial: (not trial[0].converged, trial[0].cost + price * len(trial[1])))
     if not (fitted.converged and all(is_determined(fitted, q) for q in free)):
         return None
     return replace(candidate, quantities=(*candidate.quantities, *free)), fitted
