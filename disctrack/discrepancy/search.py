@@ -10,7 +10,7 @@ better than its subsets do, and whose effects remain significant when the residu
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations, repeat
+from itertools import combinations
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -263,7 +263,8 @@ class _Search:
             best, alternatives = self._selected()
         best = replace(best, fit=settled(self.system, best.fit))
         after = self.base_model if alternatives is None else best
-        found = tuple(map(self._found, repeat(best), best.candidates, alternatives or ()))
+        pairs = () if alternatives is None else zip(best.candidates, alternatives, strict=True)
+        found = tuple(self._found(best, *pair) for pair in pairs)
         ranked = tuple(replace(e, length=self.length(e)) for e in self._ranked())
         return Diagnosis(
             *self._verdict(after, found),
@@ -306,7 +307,6 @@ class _Search:
     def _selected(self) -> tuple[Explanation, list[list[Alternative]] | None]:
         """The selected explanation, and the alternatives of each of its effects; None where it explains too little."""
         self._explore()
-        alternatives: list[list[Alternative]] = []
         while (best := self._best_supported()).candidates:
             if not self._at_noise(best.fit) and not self._explains_most(best):
                 return best, None
@@ -318,8 +318,8 @@ class _Search:
             alternatives = [self._alternatives(best, c) for c in best.candidates]
             self._explore()
             if self._best_supported() is best:
-                break
-        return best, alternatives
+                return best, alternatives
+        return best, []
 
     def _add_free_shapes(self, best: Explanation) -> bool:
         """Add explanations by laws of free shape, in place of all effects or of the faintest; True if there are any.

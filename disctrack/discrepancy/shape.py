@@ -40,7 +40,7 @@ def with_free_shape(
     if not fitted.cost < below:
         return None
     free = [q for q in candidate.shape if np.isfinite(expected_sigma(system, fitted, q))]
-    several = (free[:1], free)[: max(len(free), 1)]  # the same twice where there is one
+    several = [free[:1], free] if len(free) > 1 else [free]
     trials = [(attempt(system, (*fitted.quantities, *some), fitted.values), some) for some in several]
     fitted, free = min(trials, key=lambda trial: (not trial[0].converged, trial[0].cost + price * len(trial[1])))
     if not (fitted.converged and all(is_determined(fitted, q) for q in free)):
